@@ -21,7 +21,7 @@ from mavfi_cli.report.paper import DETECTOR_TITLES
 from mavfi_cli.stats.shares import Share, wilson
 
 LEVELS = {"source": "states", "instruction": "instructions"}
-_DECIDED = 0.25  # an answer needs this share of claims decided, and at least as many as are open
+_DECIDED = 0.25  # an answer needs this share of decided claims, and no more open than decided ones
 _COMPUTER = "x86"  # platform of the answers; only the table of balances covers all platforms
 _KINDS = {  # kinds of faults: level, and effect on the struck node
     "a wrong value in a state": ("source", Fate.ALL),
@@ -58,7 +58,7 @@ class Family:
 
     @property
     def short(self) -> str:
-        """The paper's name for it, such as `Fig. 6`."""
+        """The paper's name for the figure, table or section, such as `Fig. 6`."""
         return printed_name(self.name)
 
     @classmethod
@@ -94,7 +94,7 @@ def answer(claims: Sequence[JudgedClaim], stack: str) -> str:
 
 
 def crash_sentence(claims: Sequence[JudgedClaim], stack: str, flights: Flights) -> str:
-    """Describe how reproduced claims and lost missions depend on dead nodes; "" without faults."""
+    """Describe how reproduced claims and lost missions depend on dead nodes; "" without either."""
     parts = []
     pairs = [
         (of_all, silent)
@@ -134,10 +134,10 @@ def _are(number: int) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disagreement:
-    """Contradicted claims that one sentence explains.
+    """Contradicted claims with the same reason.
 
     Attributes:
-        reason: empty if none is known.
+        reason: why they are contradicted, in words; empty if no reason is known.
     """
 
     claims: Sequence[JudgedClaim]
@@ -217,7 +217,7 @@ class DetectorBalance:
 
     @classmethod
     def of(cls, stack: str, flights: Flights) -> Iterator[Self]:
-        """Yield the balance of every level, platform, detector and fate with flown pairs."""
+        """Yield a balance for each level, platform, detector and fate that has flown pairs."""
         watched = flights.comparable.chosen(detector=(*DETECTOR_TITLES,), bare_struck=True)
         for level, computer, detector in sorted(
             watched.by("level", "platform", "detector"), key=str
@@ -249,7 +249,7 @@ class _Against:
 
     @classmethod
     def of_pairs(cls, balance: Balance) -> _Against | None:
-        """Judge a protection on the same faults by McNemar's test; None without pairs."""
+        """Judge a protection by McNemar's test on the same faults; None without pairs."""
         if not balance.pairs:
             return None
         before, caused, pairs = balance.before, balance.caused, balance.pairs
@@ -262,7 +262,7 @@ class _Against:
 
     @classmethod
     def of_shares(cls, before: Share, after: Share) -> _Against | None:
-        """Judge a protection by the difference of shares in equal scenes; None if one is empty."""
+        """Judge a protection by the change of the harmed share; None if a share has no missions."""
         if not (before.total and after.total):
             return None
         change = after.minus(before)
@@ -285,7 +285,8 @@ class Safeguard:
 
     Attributes:
         against: effect by kind of fault; None if that kind was not flown.
-        costs: mean share of the flight time, by name of the level; empty if not measured.
+        costs: mean share of the flight time that detection and recovery take, by name of the level;
+            empty if not measured.
     """
 
     name: str
@@ -294,7 +295,7 @@ class Safeguard:
 
 
 def protections(flights: Mapping[str, Flights]) -> list[Safeguard]:
-    """Compare protections: the detectors on the first stack, and every other stack in its place."""
+    """Compare the detectors on the first stack, and each other stack used instead of the first."""
     (name, first), *others = flights.items()
     safeguards = [
         Safeguard(
@@ -343,8 +344,9 @@ class Delays:
 
     Attributes:
         level: `source` or `instruction`.
-        added_s: added flight time (n,), s, by detector (None: none); infinite for a lost mission.
-        golden_s: mean flight time of the golden flights.
+        added_s: added flight time, s, (n,), by detector (None: no detector); infinite for a lost
+            mission.
+        golden_s: mean flight time of the golden flights, s.
     """
 
     stack: str
@@ -354,7 +356,7 @@ class Delays:
 
     @classmethod
     def of(cls, stack: str, flights: Flights) -> Iterator[Self]:
-        """Yield the delays at each level, for faults that were flown with every detector."""
+        """Yield the delays at each level, for faults flown both without and with every detector."""
         hit = flights.comparable.chosen(struck=True, own_lost=False, platform=_COMPUTER)
         for level in ("source", "instruction"):
             mine = hit.chosen(level=level)
@@ -373,7 +375,7 @@ class Delays:
 
 
 def delay_sentence(parts: Sequence[Delays]) -> str:
-    """Describe how many flights end over 1 s late without and with detectors; "" if not flown."""
+    """Describe how many flights are lost or over 1 s late, by detector; "" without detectors."""
     sentences = []
     for part in parts:
         longer = {name: int((added > 1.0).sum()) for name, added in part.added_s.items()}

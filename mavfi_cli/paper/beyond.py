@@ -43,9 +43,9 @@ class KernelFlow:
     Attributes:
         fates: share of lost missions for each of FATES.
         lost, harmed: shares among all missions with a fault in the kernel.
-        silent: share of silent corruption of the isolated kernel; None if it was not run.
-        given_silent: probability that a mission is lost given such corruption, with the ends of its
-            interval; None if it is not known.
+        silent: share of runs of the isolated kernel that end in SDC; None if it was not run.
+        given_silent: probability that a mission is lost given an SDC in the kernel, with the low
+            and high end of its interval; None if unknown.
     """
 
     kernel: str
@@ -60,7 +60,7 @@ def kernel_flows(flights: Flights, alone: Mapping[str, tuple[int, int]]) -> list
     """Return the flow of each kernel struck by instruction-level faults.
 
     Args:
-        alone: numbers of silent corruptions and of faults, for each isolated kernel.
+        alone: number of SDCs and number of faults in each isolated kernel.
     """
     own = {row["pair"]: row for row in flights.golden.rows("pair", *_MEASURES)}
     hit = flights.struck(level="instruction", own_lost=False).by("struck_kernel")
@@ -129,10 +129,11 @@ class MapCell:
 
 
 def state_map(flights: Flights) -> list[MapCell]:
-    """Return a cell for every state, bit class and phase that faults struck, in sorted order.
+    """Return a cell for each combination of state, bit class and phase that a fault struck, sorted.
 
-    It counts source-level faults without a detector whose golden flights succeed. A fault in
-    several components counts for their group and for the highest bit that it flips.
+    The cells count source-level faults that were flown without a detector and have a successful
+    golden flight. A fault in several components counts once, for their group and for the highest
+    bit that it flips.
     """
     hit = flights.struck(level="source", own_lost=False)
     hit = hit.where([bool(x["struck_state"] and any(x["struck_bits"] or ())) for x in hit.rows()])
@@ -164,8 +165,8 @@ class HourlyFailures:
 
     Attributes:
         where: the struck site, the kind of corruption, the world, and the computer.
-        lost: share of faults that lose a mission whose golden flight succeeds.
-        per_hour: rate, low and high.
+        lost: share of faults whose mission is lost although its golden flight succeeds.
+        per_hour: failure rate and the low and high end of its interval, per flight hour.
     """
 
     where: str
@@ -191,7 +192,7 @@ _COMPONENTS = Counter(state.group for state in BY_NAME.values())
 
 
 def _kind(flight: Row) -> str:
-    """Describe the struck site, the corruption unless it is one bit of any field, and the world."""
+    """Describe a fault's level, site, corruption, world and platform; omit the usual values."""
     level = "instruction" if flight["level"] == "instruction" else "state"
     components = _COMPONENTS[str(flight["fault_target"]).rpartition(".")[2]]
     how = [
@@ -218,10 +219,10 @@ class Arm:
     """A stack with or without a detector.
 
     Attributes:
-        golden: lost golden flights.
+        golden: share of lost golden flights.
         lost, by_site: shares of lost missions, over all faults and by injection site.
         p_value: p-value of McNemar's exact test against the unprotected arm; None for that arm.
-        corrected_p: p-value corrected by Holm over all arms.
+        corrected_p: `p_value`, corrected for the number of arms by Holm's method.
     """
 
     name: str
@@ -233,7 +234,11 @@ class Arm:
 
 
 def arms(flights: Flights) -> list[Arm]:
-    """Return the arms of a campaign that flew several stacks, with the unprotected arm first."""
+    """Return the arms of a campaign with several stacks, the unprotected arm first.
+
+    Return an empty list if there is only one stack or arm, or if no fault that was read in the
+    unprotected arm was flown in all arms.
+    """
     if len(set(flights["stack"])) < 2:
         return []
     golden: dict[str, list[Row]] = {}
@@ -284,7 +289,7 @@ def _arm_of(flight: Row) -> str:
 
 
 def _trial_of(flight: Row) -> str:
-    """Return fault, world, start, noise and platform as text, which is the same in all arms."""
+    """Return a flight's configuration without _APART as text; it is the same in all arms."""
     config = json.loads(flight["changes"])
     return canonical({name: value for name, value in config.items() if name not in _APART})
 
@@ -310,14 +315,14 @@ def _by_site(flights: Sequence[Row]) -> dict[str, Share]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RestartComparison:
-    """Success of a stack in a world on the same faults, by restart delay of a dead node.
+    """Success of a stack in a world on the same faults, with different restart delays.
 
     Attributes:
-        paper: success that Table IV prints for golden flights and for faults, %; None if it has no
-            such world.
-        golden: success of the golden flights.
-        success: success with faults in instructions, for each restart rule.
-        lost: lost missions among the faults of each fate, for each restart rule.
+        paper: success rates in Table IV for golden flights and for flights with a fault, %; None if
+            it lacks the world.
+        golden: share of golden flights that succeed.
+        success: share of missions with instruction-level faults that succeed, by restart rule.
+        lost: share of missions that are lost, by restart rule and fate of the fault.
         p_value: p-value of McNemar's exact test between the earliest and the latest restart.
     """
 

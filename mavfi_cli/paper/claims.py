@@ -47,7 +47,8 @@ def judged(
 
     Args:
         flights: flights by stack.
-        settled: the missions flown to settle claims, by stack; other stacks have none.
+        kernels: summaries of the isolated kernels, by name.
+        settled: the missions flown to settle claims, by stack; absent if a stack has none.
     """
     settled = settled or {}
     judgements: dict[str, dict[str, dict[Fate, Judgement]]] = {claim.name: {} for claim in CLAIMS}
@@ -136,7 +137,7 @@ def _read(path: Path) -> Iterator[Claim]:
 
 
 def _range(entry: dict[str, Any]) -> tuple[float, float, str]:
-    """Remove the range from a claim's entry; return its ends, and its rule in words."""
+    """Remove the range from a claim's entry; return its low and high end, and its rule in words."""
     whole = entry.get("unit", "points") in _WHOLE
     if "size" in entry:
         size = entry.pop("size")
@@ -181,7 +182,7 @@ def _in_the_paper(words: str, counts: Sequence[Count]) -> str:
 
 
 def _spread(counts: Sequence[Count]) -> Interval:
-    """Return a rate, a difference, a recovered share or a difference of losses, by the counts."""
+    """Return a rate, difference, recovered share or difference of losses for 1 to 4 counts."""
     if len(counts) == 3:
         return recovered_share(*counts)
     first, *others = (wilson(*count) for count in counts)

@@ -1,4 +1,4 @@
-"""The content of the page of results; `mavfi_cli.report.page` fills the template with it."""
+"""The content of the results page. `mavfi_cli.report.page` inserts it into the template."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DETECTORS = {None: "no detector"} | DETECTOR_TITLES
-_LONGEST = 5  # successful flights that are listed for a campaign
-_PICTURES, _LARGEST_PICTURE = 40, 500_000  # most pictures of kept flights on the page; bytes
+_LONGEST = 5  # maximum number of successful flights listed per campaign
+_PICTURES, _LARGEST_PICTURE = 40, 500_000  # maximum pictures on the page; maximum bytes of one
 Step = Callable[[str], object]  # called with the name of each step
 
 
@@ -102,7 +102,7 @@ class _ItemPart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _ShownItem:
-    """An item of the paper with its parts, and the places that have none."""
+    """An item of the paper with its parts, and the names of the sources that provide none."""
 
     item: Item
     parts: Sequence[_ItemPart]
@@ -116,7 +116,7 @@ class _ListedMission:
     Attributes:
         ratio: flight time divided by that of the golden flight; None if the mission is lost.
         command: command that repeats the flight.
-        picture: its top view as a data URL; empty if it was not kept.
+        picture: its top view as a data URL; empty if the page does not show it.
     """
 
     number: int
@@ -131,7 +131,7 @@ class _ListedMission:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _CampaignMissions:
-    """The lost missions of a campaign, and the longest of the others."""
+    """The lost missions of a campaign, and the successful ones with the highest `ratio`."""
 
     name: str
     lost: Sequence[_ListedMission]
@@ -140,7 +140,7 @@ class _CampaignMissions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Document:
-    """The whole page. `stack` is the first stack with flights; the others are collapsed."""
+    """The content of the page. It shows `stack` first and collapses the other stacks."""
 
     version: str
     stacks: Sequence[str]
@@ -176,7 +176,7 @@ class Document:
 
     @property
     def stack(self) -> str:
-        """The stack whose verdicts are shown first."""
+        """The stack whose verdicts are shown first: the first of STACKS with flights."""
         return self.stacks[0]
 
     def reason(self, judged: JudgedClaim) -> str:
@@ -256,7 +256,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
 
 
 def _advice(guards: Sequence[Safeguard]) -> str:
-    """Advice for a designer: a sentence for each kind of fault that did harm."""
+    """Advise a designer: write one sentence for each kind of fault that did harm."""
     sentences = []
     for kind in guards[0].against if guards else ():
         effects = {guard.name: cell.effect for guard in guards if (cell := guard.against[kind])}
@@ -273,7 +273,7 @@ def _extent(
     kernels: Mapping[str, IsolatedKernel],
     claims: Sequence[JudgedClaim],
 ) -> str:
-    """State how many claims are judged, and by how many missions and runs."""
+    """State how many claims are judged, and from how many missions and runs."""
     missions = sum(map(len, flights.values()))
     runs = sum(kernel.runs for kernel in kernels.values())
     attacked = f" and {runs:,} runs of isolated kernels" if runs else ""
@@ -320,7 +320,7 @@ def _forest(claims: Sequence[JudgedClaim], stacks: Sequence[str]) -> Picture | N
 
 
 def _delay_picture(parts: Sequence[Delays]) -> Picture | None:
-    """Draw the share of faulty flights with more than a given delay, over the delay."""
+    """Plot the share of faulty flights that exceed a delay, against the delay."""
     if not parts:
         return None
     curves = {
@@ -343,7 +343,7 @@ def _delay_picture(parts: Sequence[Delays]) -> Picture | None:
 
 
 def _spread(stack: str, flights: Flights) -> Picture | None:
-    """Draw flight times with faults in states, relative to golden, by world and detector."""
+    """Plot flight times with state faults, relative to golden flights, by world and detector."""
     seen = {"level": "source", "platform": "x86", "struck": True, "detector": (*_DETECTORS,)}
     hit = flights.comparable.timed.chosen(**seen)
     groups = hit.by("world", "detector")
@@ -392,7 +392,7 @@ def _arm_picture(campaign: str, rows: Sequence[Arm]) -> Picture:
 
 
 def _matrices(stack: str, cells: Sequence[MapCell]) -> Iterator[_StateMatrix]:
-    """Yield a matrix for each phase and kind of state."""
+    """Yield a matrix for each flight phase and type of state that has cells."""
     for phase in sorted({cell.phase for cell in cells}):
         for columns in BIT_CLASSES:
             mine = [cell for cell in cells if cell.bits in columns and cell.phase == phase]
@@ -434,7 +434,7 @@ def _missions(campaigns: Sequence[CampaignSource]) -> Iterator[_CampaignMissions
 def _listed(
     flight: Mapping[str, Any], source: CampaignSource, pictured: bool = False
 ) -> _ListedMission:
-    """Describe a mission; its command names an export by its relative path or its file name."""
+    """Describe a mission. Its command shortens the absolute path of an export to the file name."""
     struck_state = f"{flight['fault_target']}, {flight['fault_field'] or 'any'}"
     fault = "golden" if flight["level"] is None else struck_state
     kept = source.may_have_runs and _is_kept(flight["path"])
@@ -454,7 +454,10 @@ def _listed(
 
 
 def _flight_picture(run: Path) -> str:
-    """Return the top view of a kept run as a data URL, in which a browser runs no script."""
+    """Return a run's top view as a data URL; "" if it is missing, a link or too large.
+
+    A browser runs no scripts in an image that it loads from a data URL.
+    """
     path = RunFolder(run).picture
     if path.is_symlink() or not path.is_file() or path.stat().st_size > _LARGEST_PICTURE:
         return ""
@@ -518,7 +521,7 @@ def _item_picture(item: Item, place: str, figure: Figure, csv: str) -> Picture:
 
 
 def _with_runs(item: Item, stack: str, evidence: Evidence) -> Flights | None:
-    """Return the item's flights in the first campaign that kept all their run folders."""
+    """Return an item's flights from the first campaign that kept all their run folders, or None."""
     folders = [source for source in evidence.campaigns if source.may_have_runs]
     several = (Flights.pooled([source.flights], stack) for source in folders)
     own = (of_kind(item, stack, flights) for flights in several)
@@ -530,7 +533,7 @@ def _is_kept(run: str | None) -> bool:
 
 
 def _over_own(flights: Flights) -> Iterator[dict[str, Any]]:
-    """Yield the successful faulty flights, with the columns in which they differ."""
+    """Yield a row for each successful faulty flight: the settings that vary, and the time ratio."""
     rows = flights.timed.rows(*_SETTING)
     varying = [name for name in _SETTING if len({row[name] for row in rows}) > 1]
     for row, ratio in zip(rows, flights.timed.ratios, strict=True):

@@ -33,19 +33,20 @@ _Row = tuple[
     str, str | None, Flights, float | None
 ]  # label, detector, flights, the paper's longest
 _Drawing = Callable[[Flights, str], "Figure"]
-_STYLES = {None: 1, "gad": 2, "aad": 3}  # of the detectors
+_STYLES = {None: 1, "gad": 2, "aad": 3}  # index into the palette, by detector
 _NOTHING = "nothing to draw: no mission of the figure has flown yet"
 
 
 def draw(table: PaperTable, flights: Flights | None, columns: str) -> Figure:
-    """Draw the figure of an item from its flights, or the dots of its table.
+    """Draw an item's figure from its flights, or from its table if it has no drawing of flights.
 
     Args:
-        flights: None if nothing was flown. `fig13` needs their kept run folders, from one campaign.
+        flights: the item's flights; None for an item without flights. `fig11` and `fig13` read
+            their run folders; those for `fig13` must belong to one campaign.
         columns: width, `one` or `two`.
 
     Raises:
-        RecordError: the figure has no flights, or their run folders do not exist.
+        RecordError: there are no rows or flights to draw, or no run folder was kept.
     """
     if not table.rows or (flights is not None and not len(flights)):
         raise RecordError(_NOTHING)
@@ -55,7 +56,7 @@ def draw(table: PaperTable, flights: Flights | None, columns: str) -> Figure:
 
 
 def panel(rows: Iterable[_Row]) -> list[Strip]:
-    """Draw distributions of flight times relative to those of the golden flights."""
+    """Return a strip for each row, with the increases in flight time over golden flights, %."""
     return [
         Strip(label=label, values=flights.increases, style=_STYLES[detector], paper=paper)
         for label, detector, flights, paper in rows
@@ -113,7 +114,7 @@ def _fig12(flights: Flights) -> dict[str, list[_Row]]:
 
 
 def _fig14(flights: Flights) -> dict[str, list[_Row]]:
-    """Build the panels, with the part of the worst increase that the paper leaves unrecovered."""
+    """Build a panel per world, with the part of the paper's worst increase left unrecovered."""
     panels: dict[str, list[_Row]] = {}
     for world in flights.worlds:
         here = flights.chosen(world=world)
@@ -150,10 +151,10 @@ def _fig11(flights: Flights, columns: str) -> Figure:
 
 
 def _fig13(flights: Flights, columns: str) -> Figure:
-    """Top view of the pair whose flight time grows most."""
+    """Draw the top view of the pair whose flight time grows most."""
     kept = [Path(path) for path in flights["path"] if path]
     if not kept:
-        raise RecordError("fig13 needs recorded flights, but no run folder was kept (--keep all)")
+        raise RecordError("fig13 needs run folders, but none were kept (fly with --keep all)")
     with Ledger(kept[0].parents[1]) as ledger:
         flown = Trajectories.of(pair(ledger, among=frozenset(flights["number"])))
     figure = flown.draw(across=1 if columns == "one" else 2)

@@ -25,21 +25,21 @@ from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.paper.items import ITEMS, KERNELS_FOLDER, FlightsPlan, Source
 from mavfi_cli.report.attacks import save_runs, summarise
 
-_MEASURED = 12  # missions to measure for a forecast, if too few have finished
-_OF_A_KIND = 4  # finished missions of a kind that need no further measurement
-_NEWEST = 2000  # most finished missions that a forecast reads, newest first
-_ROW_BYTES, _FOLDER_BYTES = 20_000, 2_000_000  # of a mission in the ledger, and of a kept run
-_PROFILES_BYTES = 10_000_000  # of the profiles of one golden flight
+_MEASURED = 12  # missions to measure for a forecast if too few have finished
+_OF_A_KIND = 4  # a kind with this many finished missions needs no measurement
+_NEWEST = 2000  # maximum number of finished missions in a forecast: the last ones
+_ROW_BYTES, _FOLDER_BYTES = 20_000, 2_000_000  # per mission in the ledger; per kept run
+_PROFILES_BYTES = 10_000_000  # profiles of one golden flight
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Forecast:
-    """The missions that are left to fly, and the time and space that they take on this machine.
+    """The missions and kernel runs left to do, and their time and disk space on this machine.
 
     Attributes:
         missions, over: number of missions of the items, and how many of them are finished.
-        seconds: wall time of the rest; it excludes missions if none has been measured.
-        disk_bytes: space for the rest, including profiles that are removed later.
+        seconds: wall time of the rest, s; excludes missions if none has been measured.
+        disk_bytes: disk space for the rest, including profiles that are removed later.
         measured: number of missions on which the forecast is based; may be 0 if few are left.
         jobs: number of concurrent missions or runs.
         runs: number of missing runs of isolated kernels.
@@ -77,14 +77,16 @@ def reproduce(
     spectator: Spectator,
     on_forecast: Callable[[Forecast], None],
 ) -> None:
-    """Fly the missions of the items that the folder lacks, and run the kernels for Fig. 6.
+    """Fly the plan's missing missions, and run the isolated kernels if its items include Fig. 6.
 
     Args:
-        on_forecast: called with the forecast, after a few missions and runs, and before the rest.
+        on_forecast: called once with the forecast, after the missions and runs that it measures and
+            before the rest.
 
     Raises:
-        ConfigError: the folder holds another stack, more missions, or another campaign.
-        RecordError: the disk does not have enough room.
+        ConfigError: the folder holds another campaign, or a reproduction that was begun with
+            another stack, other worlds, a larger scale or other program versions.
+        RecordError: the disk has too little free space.
         MavfiError: a mission or a kernel cannot be run.
     """
     jobs = options.jobs or len(os.sched_getaffinity(0))
@@ -112,7 +114,7 @@ def reproduce(
 
 
 class _Ahead(Spectator):
-    """Forwards all events, and adds the work that follows the missions to the time left."""
+    """Forwards events of the missions, and adds the time of the kernel runs to the time left."""
 
     def __init__(self, spectator: Spectator, beyond_s: float) -> None:
         self._spectator, self._beyond_s = spectator, beyond_s
@@ -128,10 +130,11 @@ class _Ahead(Spectator):
 
 
 def opened(plan: FlightsPlan) -> Ledger:
-    """Open the ledger of the plan's stack for writing, and store the missions of all items.
+    """Open the ledger of the plan's stack for writing, and store the planned missions of all items.
 
     Raises:
-        ConfigError: the folder holds another campaign, or one begun with other versions.
+        ConfigError: the folder holds another campaign, or was begun with another stack, other
+            worlds, a larger scale or other program versions.
     """
     if (plan.folder / LEDGER).is_file():
         with Ledger(plan.folder) as ledger:
@@ -164,7 +167,7 @@ def _require_same(plan: FlightsPlan, stored: FlightsPlan | None) -> None:
 
 
 def _missing(ledger: Ledger, wanted: frozenset[int]) -> dict[int, str]:
-    """Return the kinds of the wanted missions without a result, by mission number."""
+    """Return the kind of each wanted mission that has no result, by mission number."""
     return {
         mission.number: _kind(mission.config.instruction, mission.config.fault)
         for mission in ledger.missing()
@@ -175,9 +178,10 @@ def _missing(ledger: Ledger, wanted: frozenset[int]) -> dict[int, str]:
 def _measured(
     ledger: Ledger, wanted: frozenset[int], options: Options, spectator: Spectator
 ) -> list[int]:
-    """Fly a few missions of each rarely finished kind; return the missions that a forecast uses.
+    """Fly a few missions of each kind with few results; return the missions to forecast from.
 
-    The first missions also fly golden flights that later ones share, so they are not measured.
+    Some missions are flown first and not measured, because they also fly golden flights that later
+    missions share.
     """
     missing = _missing(ledger, wanted)
     over = sorted(wanted.difference(missing))[-_NEWEST:]
@@ -190,7 +194,7 @@ def _measured(
     rare = [numbers for kind, numbers in kinds.items() if known[kind] < _OF_A_KIND]
     first, measured = list[int](), list[int]()
     for place, numbers in enumerate(sorted(rare, key=len)):
-        last = min(len(numbers), len(ledger.cells())) - 1  # of the first repetition
+        last = min(len(numbers), len(ledger.cells())) - 1  # last place in the first repetition
         count = -(-(_MEASURED - len(measured)) // (len(rare) - place))
         places = range(0, last, max(2, last // count))[:count]
         first += [numbers[place] for place in places]
@@ -214,12 +218,12 @@ def _kinds(results: Iterable[MissionResult]) -> list[tuple[str, float]]:
 
 
 def remaining_s(measured: Iterable[tuple[str, float]], missing: Mapping[str, int]) -> float:
-    """Estimate the wall time of missing missions, flown one by one, from each kind's mean, s.
+    """Estimate the wall time of flying the missing missions one after another, s.
 
     Args:
-        measured: kind and wall time of finished missions.
-        missing: number of missing missions of each kind. A kind without measurements gets the
-            mean of all.
+        measured: kind and wall time, s, of each finished mission.
+        missing: number of missing missions of each kind. Each takes the mean time of its kind,
+            or of all measured missions if its kind was not measured.
     """
     times: dict[str, list[float]] = {}
     for kind, wall_s in measured:
@@ -261,7 +265,7 @@ def _with_flights(
 
 
 def _mean_size(parent: Path, unknown: float) -> float:
-    """Return the mean size of the newest folders of a parent, bytes; `unknown` if it has none."""
+    """Return the mean size of up to 20 subfolders of `parent`, bytes; `unknown` if it has none."""
     folders = [path for path in parent.glob("*") if path.is_dir()][-20:]
     files = (path for folder in folders for path in folder.rglob("*") if path.is_file())
     return sum(path.stat().st_size for path in files) / len(folders) if folders else unknown
@@ -273,19 +277,20 @@ def _require_room(out: Path, forecast: Forecast) -> None:
     if forecast.disk_bytes > free:
         raise RecordError(
             f"{out}: needs about {forecast.disk_bytes / 1e9:.1f} GB, but only {free / 1e9:.1f} GB "
-            "are free"
+            "is free"
         )
 
 
 # Isolated kernels, which depend on no stack -------------------------------------------------------
 
-_PAPER_RUNS = 5000  # of each kernel
+_PAPER_RUNS = 5000  # per kernel
 _SEED = 1
-# The forecast runs the quickest kernel, and scales the times in docs/results/kernels.json by it.
+# The forecast times the quickest kernel here, and scales the times in docs/results/kernels.json
+# in proportion.
 _QUICKEST, _QUICK_RUNS = "control", 100
-_QUICKEST_RUN_S = 35.0 / 5000  # in that file
-_PREPARE_S, _RUN_OF_EACH_S = 738.0, 1965.0 / 5000  # of all kernels together, in that file
-_RECORD_BYTES = 2000  # of the record of a run
+_QUICKEST_RUN_S = 35.0 / 5000  # from that file
+_PREPARE_S, _RUN_OF_EACH_S = 738.0, 1965.0 / 5000  # of all kernels together, from that file
+_RECORD_BYTES = 2000  # record of one run
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -304,11 +309,11 @@ class _KernelRuns:
 
     @property
     def folder(self) -> Path:
-        """The folder of the runs, as for `mavfi kernels --out`."""
+        """The folder of the runs, with the same contents as that of `mavfi kernels --out`."""
         return self.out / KERNELS_FOLDER
 
     def missing(self) -> int:
-        """Count the runs that the summary lacks."""
+        """Count the runs that the stored summary lacks, over all kernels."""
         path = self.folder / KERNELS
         if not path.is_file():
             return self.runs * len(select(()))
@@ -316,7 +321,7 @@ class _KernelRuns:
         return sum(max(0, self.runs - done.get(name, 0)) for name in select(()))
 
     def forecast_s(self) -> float:
-        """Estimate the wall time of the missing runs from a few runs of the quickest kernel, s."""
+        """Estimate the wall time of the missing runs, s, by timing the quickest kernel."""
         with ScratchFolder("kernels") as scratch:
             targets = _targets([_QUICKEST], scratch)
             (measured,) = run_campaign(Plan(runs=_QUICK_RUNS, seed=_SEED), targets)
@@ -329,7 +334,7 @@ class _KernelRuns:
         """Execute the missing runs, and write their summary.
 
         Raises:
-            MavfiError: as `attack.campaign.run_campaign`.
+            MavfiError: as for `attack.campaign.run_campaign`.
         """
         plan = Plan(runs=self.runs, seed=_SEED)
         targets = _targets((), self.folder)

@@ -1,7 +1,7 @@
 """The items of the paper: its figures and tables of experiments, with their numbers and missions.
 
 paper.toml contains the items and all numbers that the paper prints. The missions of several items
-form one list without duplicates.
+are merged into one list without duplicates.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mavfi_cli.report.paper import PaperColumn, PaperRow, PaperTable, Printed
 
 _PAPER, _ = read_toml(Path(__file__).parent / "paper.toml")
 _META = "reproduction"  # key of the ledger's `meta`
-STACKS = ("mavbench", "hardened")  # the paper's, and ours
+STACKS = ("mavbench", "hardened")  # the paper's stack, and ours
 OUT, KERNELS_FOLDER = Path("reproduction"), "kernels"
 Key = str  # the configuration of a mission as text; equal missions have equal keys
 _ROMAN = ("", "I", "II", "III", "IV", "V", "VI", "VII")
@@ -36,7 +36,7 @@ class Source(Enum):
 
     FLIGHTS = "flights"
     KERNELS = "kernels"  # runs of isolated kernels
-    MODEL = "model"  # the performance model, which flies nothing
+    MODEL = "model"  # the performance model; no missions are flown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,10 +44,10 @@ class Item:
     """A figure or a table of the paper.
 
     Attributes:
-        name: as on the command line, such as `fig6`.
-        labels, columns, notes: parts of its table, as paper.toml explains.
+        name: its name on the command line, such as `fig6`.
+        labels, columns, notes: parts of its table; paper.toml explains them.
         origin: where the paper prints its numbers, and which results it only plots.
-        preset: campaign with the item's missions; empty if its source is not flights.
+        preset: campaign that contains the item's missions; empty if its source is not FLIGHTS.
     """
 
     name: str
@@ -122,8 +122,8 @@ def items_named(names: Sequence[str]) -> tuple[Item, ...]:
     """Return the named items, in the order of ITEMS; without names, return all.
 
     Raises:
-        UnknownName: there is no such item. The message suggests the nearest.
-        ConfigError: the item of the paper is not an experiment. The message describes it.
+        UnknownName: no item has this name. The message suggests the nearest name.
+        ConfigError: the named figure or table is not an experiment. The message says what it is.
     """
     for name in names:
         if name in LEFT_OUT:
@@ -144,7 +144,7 @@ class FlightsPlan:
 
     Attributes:
         scale: fraction of the paper's number of missions.
-        worlds: `fixed`, one world of each environment, or `many`, one for each seed.
+        worlds: `fixed` for one world per environment, or `many` for one per seed.
         out: folder of all reproductions; each stack has its own folder in it.
     """
 
@@ -160,7 +160,7 @@ class FlightsPlan:
         text = ledger.meta(_META)
         if text is None:
             return None
-        stored = {"worlds": "many", **json.loads(text)}  # a plan before there were fixed worlds
+        stored = {"worlds": "many", **json.loads(text)}  # older plans lack `worlds`
         return cls(items=ITEMS, out=ledger.folder.parent, **stored)
 
     @property
@@ -182,10 +182,11 @@ class FlightsPlan:
         return shlex.join(["mavfi", "reproduce", *options])
 
     def missions(self, *items: Item) -> list[PlannedMission]:
-        """List the missions repetition by repetition, so that all items grow together.
+        """List the missions without duplicates, by repetition, so that all items grow together.
 
         Raises:
-            ConfigError: the scale leaves no missions, or the stack cannot be used.
+            ConfigError: the scale is not above 0, there are too many missions, or the stack cannot
+                be used.
         """
         planned = [
             (mission.config.seed - spec.first_seed, mission)
@@ -198,33 +199,33 @@ class FlightsPlan:
         return list(once.values())
 
     def kinds(self, *items: Item) -> list[PlannedMission]:
-        """Return the first mission of each kind; the others differ only in seeds."""
+        """Return the first mission of each kind. Missions of one kind differ only in seeds."""
         return [mission for spec in self._specs(items, 1.0) for mission in spec.kinds()]
 
     def numbered(self, item: Item, first: int, end: int) -> list[tuple[PlannedMission, int]]:
-        """List an item's missions with their repetitions, which go from `first` to below `end`."""
+        """List an item's missions and their repetitions, for repetitions `first` to `end` - 1."""
         specs = (spec.scaled(end / spec.repetitions) for spec in self._specs([item], 1.0))
         missions = ((mission, mission.config.seed - spec.first_seed)
                     for spec in specs for mission in spec.missions())  # fmt: skip
         return [own for own in missions if own[1] >= first]
 
     def keys(self, *items: Item) -> list[Key]:
-        """Return the configurations of the missions, as the ledger stores them."""
+        """Return the missions' configurations as text, as the ledger stores them."""
         return [key_of(mission) for mission in self.missions(*items)]
 
     def numbers(self, ledger: Ledger, *items: Item) -> list[int]:
-        """Return the numbers of the missions in a ledger, in the order of its list."""
+        """Return the numbers that a ledger gives the missions, in the order of its list."""
         return _numbers_of(ledger, self.keys(*items))
 
     def kept(self, ledger: Ledger) -> list[int]:
-        """Return the numbers of the missions whose run folders any item needs."""
+        """Return the numbers of the missions whose run folders an item of ITEMS needs."""
         specs = (spec for spec in self._specs(ITEMS, self.scale) if spec.keep is Keep.ALL)
         return _numbers_of(
             ledger, (key_of(mission) for spec in specs for mission in spec.missions())
         )
 
     def _specs(self, items: Iterable[Item], scale: float) -> list[Spec]:
-        """Return the campaigns of items without duplicates, in the order of ITEMS."""
+        """Return the distinct campaigns of the items, in the order of ITEMS."""
         wanted = set(items) or set(self.items)
         presets = dict.fromkeys(item.preset for item in ITEMS if item in wanted and item.preset)
         specs = [load_spec(preset).scaled(scale) for preset in presets]
@@ -239,5 +240,5 @@ def _numbers_of(ledger: Ledger, keys: Iterable[Key]) -> list[int]:
 
 
 def key_of(mission: PlannedMission) -> Key:
-    """Return the configuration of a mission, as the ledger stores it."""
+    """Return a mission's configuration as text, as the ledger stores it."""
     return canonical(changes_of(mission.config))

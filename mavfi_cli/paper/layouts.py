@@ -1,8 +1,8 @@
-"""Layouts, which turn the missions of each flown item into the paper's table.
+"""Layouts, which turn the missions of each flown item into the rows of the paper's table.
 
-A layout reads only the configuration and record of the item's missions, never labels, so it works
-for any campaign with such missions. It yields the cells of each row; paper.toml contains
-headings, columns and notes.
+A layout reads only the configurations and records of the item's missions, not the labels of their
+settings, so it works for any campaign with such missions. It yields the rows; paper.toml contains
+the headings, columns and notes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _NOTHING = "nothing flown yet"
 
 
 def of_flights(name: str, flights: Flights) -> PaperTable:
-    """Return the table of a flown item.
+    """Return the table of an item whose source is FLIGHTS.
 
     Args:
         flights: the item's missions.
@@ -52,9 +52,9 @@ _SEEDS = ("seed", "world_seed", "time_limit_s")
 
 
 def of_kind(item: Item, stack: str, flights: Flights) -> Flights:
-    """Select the flights that differ from the item's missions on a stack only in _SEEDS.
+    """Select the flights that match a mission of the item on a stack in all settings except _SEEDS.
 
-    The result is empty if all are golden and the item needs flights with a fault.
+    The result is empty if all of these flights are golden although the item needs faults.
     """
     kinds = {
         kind_of(changes_of(mission.config), _SEEDS)
@@ -68,11 +68,11 @@ def of_kind(item: Item, stack: str, flights: Flights) -> Flights:
 
 
 _GOLDEN_ONLY = ("fig11",)
-_ONLY_COMPARABLE = ("fig12", "table4", "table5")  # exclude flights that protect only some stages
+_ONLY_COMPARABLE = ("fig12", "table4", "table5")  # exclude partly protected flights
 
 
 def _unpaired(flights: Flights) -> list[str]:
-    """Report the flights with a fault whose effect is unknown, with the reason."""
+    """Count the faulty flights whose effect is unknown because no golden flight exists."""
     struck = flights.where(level is not None for level in flights["level"])
     alone = list(struck["own_lost"]).count(None)
     if not alone:
@@ -104,7 +104,7 @@ def _effects(flights: Flights) -> list[PaperCell]:
 
 
 def _fig7(flights: Flights) -> Iterator[PaperRow]:
-    """Faults in each kernel, after the golden flights with each planner."""
+    """Yield a row for the golden flights with each planner, then for the faults in each kernel."""
     groups = {
         f"{_GOLDEN}, {title}": flights.golden.chosen(planner=name)
         for name, title in _PLANNERS.items()
@@ -119,7 +119,7 @@ def _fig7(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _by_value(name: str, column: str) -> Callable[[Flights], Iterator[PaperRow]]:
-    """Return a layout of faults by value of a column, with the paper's word for each value."""
+    """Return a layout with a row per value of a column, and whether the paper calls it critical."""
 
     def rows(flights: Flights) -> Iterator[PaperRow]:
         yield _row(_GOLDEN, "", cells=_effects(flights.golden))
@@ -130,7 +130,7 @@ def _by_value(name: str, column: str) -> Callable[[Flights], Iterator[PaperRow]]
     return rows
 
 
-_QUALITY = {  # the paper's name of a measure, its column, and its scale
+_QUALITY = {  # the paper's name of a measure: our column, and its scale
     "flight_time_s": ("flight_time_s", 1.0),
     "distance_m": ("distance_m", 1.0),
     "energy_kj": ("energy_regression_j", _JOULES),
@@ -139,7 +139,7 @@ _QUALITY = {  # the paper's name of a measure, its column, and its scale
 
 
 def _table3(flights: Flights) -> Iterator[PaperRow]:
-    """Quality of flight by the number of flipped bits."""
+    """Yield the quality of flight for each number of flipped bits."""
     groups = {0: flights.golden}
     faults = flights.faulty().by("fault_bits")
     groups |= {bits: faults[bits,] for (bits,) in sorted(faults)}
@@ -156,7 +156,7 @@ def _table3(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _table4(flights: Flights) -> Iterator[PaperRow]:
-    """Success in each world: golden, with faults, with each detector."""
+    """Yield the success in each world: golden, with faults, and with faults and each detector."""
     settings = [(_GOLDEN, "golden", flights.golden), ("injection", "none", flights.faulty())]
     settings += [(f"{title}-based", x, flights.faulty(x)) for x, title in DETECTOR_TITLES.items()]
     for title, key, those in settings:
@@ -168,7 +168,7 @@ def _table4(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _fig12(flights: Flights) -> Iterator[PaperRow]:
-    """Worst flight time with faults, and how much of it each detector recovers, in points."""
+    """Yield each world's worst increase in flight time, and the points each detector recovers."""
     for world in flights.worlds:
         here = flights.chosen(world=world)
         bare, struck = here.golden, here.faulty()
@@ -182,14 +182,14 @@ def _fig12(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _recovered(flights: Flights, item: str, unit: str, place: str) -> Iterator[PaperCell]:
-    """Yield the part of the worst flight that each detector recovers, with the paper's number."""
+    """Yield how much of the worst increase each detector recovers, next to the paper's number."""
     measure = "recovered" if unit == "recovered_points" else "recovered_share"
     for name in DETECTOR_TITLES:
         yield _recovery(flights.faulty(name), measure, printed(item, unit, name, place))
 
 
 def _fig14(flights: Flights) -> Iterator[PaperRow]:
-    """Share of the worst increase that each detector recovers, by protected stages."""
+    """Yield the share of the worst increase that each detector recovers, by protected stages."""
     for detector, title in DETECTOR_TITLES.items():
         for stages in PROTECTED:
             paper = ("fig14", "recovered_percent", detector)
@@ -205,7 +205,7 @@ def _fig14(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _table5(flights: Flights) -> Iterator[PaperRow]:
-    """Shares of the flight time that detection and recovery take."""
+    """Yield the shares of the flight time that detection and recovery take."""
     for detector in DETECTOR_TITLES:
         for title, (columns, keys) in _parts(detector).items():
             cells = (
@@ -219,7 +219,7 @@ def _table5(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _unknown_costs(flights: Flights) -> list[str]:
-    """Explain why flights with a detector have no costs; empty if they have."""
+    """Return a note if there are flights with a detector but no costs; otherwise nothing."""
     watched = any(flights["detector"])
     if not watched or len(flights.known("check_share")):
         return []
@@ -227,7 +227,7 @@ def _unknown_costs(flights: Flights) -> list[str]:
 
 
 def _parts(detector: str) -> dict[str, tuple[Sequence[str], Sequence[str]]]:
-    """Return the rows of a detector: columns to add up, and the keys of the paper's number."""
+    """Return the columns to sum and the keys of the paper's number, for each row of a detector."""
     recovery = [f"recovery_share_{stage}" for stage in STAGES]
     apart = {
         stage: ([column], ["recovery", detector, stage])
@@ -248,9 +248,9 @@ SHOWN_STATES = ("waypoint_x", "waypoint_vx", "waypoint_ax")
 
 
 def values_and_deltas(flights: Flights) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Read SHOWN_STATES at all control ticks, and their changes from tick to tick.
+    """Return SHOWN_STATES at all control ticks, and their changes from tick to tick, by state.
 
-    The values come from the traces of the successful flights whose run folders exist.
+    They come from the traces of the successful flights whose run folders exist.
     """
     runs = [Path(path) for path in flights.chosen(lost=False)["path"] if path]
     traces = [read_parquet(run / TRACE, "trace") for run in runs if (run / TRACE).is_file()]
@@ -265,7 +265,7 @@ def values_and_deltas(flights: Flights) -> dict[str, tuple[FloatArray, FloatArra
 
 
 def _fig11(flights: Flights) -> Iterator[PaperRow]:
-    """Ranges of the values of three states, and of their changes."""
+    """Yield the ranges of three states and of their changes between ticks."""
     for state, (values, deltas) in values_and_deltas(flights.golden).items():
         spans = [_span(values, 1.0), _span(deltas, 1.0)]
         middle = [_span(values, 0.99), _span(deltas, 0.99)]
@@ -288,7 +288,7 @@ def _reduction(values: float, deltas: float) -> float:
 
 
 def _fig13(flights: Flights) -> Iterator[PaperRow]:
-    """For each stage, the flight that a fault prolongs most, without and with the autoencoder."""
+    """Yield each stage's largest increase in flight time, without and with the autoencoder."""
     for (stage,), struck in flights.faulty().by("fault_target").items():
         yield _row(stage, cells=[
             _maximum(struck.increases, printed("fig13", "increase_percent", stage)),
@@ -298,7 +298,7 @@ def _fig13(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _with(struck: Flights, protected: Flights) -> FloatArray:
-    """Return the protected flight's increase for the fault that prolongs most, (1,) or (0,)."""
+    """Return the increase with protection, %, for the worst unprotected fault, (1,) or (0,)."""
     if not len(struck.ratios):
         return np.zeros(0)
     pair, fault = struck.faults[int(np.nanargmax(struck.numbers("over_own")))]
@@ -309,7 +309,7 @@ def _with(struck: Flights, protected: Flights) -> FloatArray:
 
 
 def _fig16(flights: Flights) -> Iterator[PaperRow]:
-    """Worst flight time on each platform, and how much of it each detector recovers."""
+    """Yield each platform's worst flight-time ratio, and how much of it each detector recovers."""
     for (platform,), here in flights.by("platform").items():
         struck = here.faulty()
         yield _row(platform, cells=[
@@ -336,12 +336,12 @@ def _joined(
     between: str = "; ",
     rows: Callable[[PaperTable], Sequence[PaperRow]] = attrgetter("rows"),
 ) -> Callable[[PaperTable], str]:
-    """Return a function that joins a formatted part of each selected row.
+    """Return a function that formats each selected row and joins the results.
 
     Args:
-        form: format of a part: the row's labels, its numbers `c` in per cent, `s` in seconds and
-            `n` without a unit, the `last` of `c`, and the titles `one` and `end` of the first and
-            last column.
+        form: format string for a row. Its fields are the row's labels by position; the lists of the
+            row's numbers `c` in per cent, `s` in seconds and `n` without a unit; the `last` number
+            of `c`; and the titles of the first and the last column, `one` and `end`.
     """
 
     def joined(table: PaperTable) -> str:
@@ -403,7 +403,7 @@ def _success(flights: Flights, paper: Printed = None) -> PaperCell:
 
 
 def _mean(flights: Flights, name: str, paper: Printed = None, scale: float = 1.0) -> PaperCell:
-    """Mean of a measure over the successful missions."""
+    """Average a measure over the successful missions."""
     return PaperCell.of_mean(scale * _of_successes(flights, name), paper)
 
 
@@ -418,7 +418,7 @@ def _maximum(values: FloatArray, paper: Printed = None) -> PaperCell:
 
 
 def _worst_mean(bare: Flights, flights: Flights, paper: Printed = None) -> PaperCell:
-    """Return the increase from the mean golden flight to the longest flight, in per cent."""
+    """Return the increase from the mean golden to the longest flight time, in per cent."""
     golden_s, times_s = (_of_successes(those, "flight_time_s") for those in (bare, flights))
     if not (len(golden_s) and len(times_s)):
         return PaperCell(paper=paper)
@@ -430,7 +430,7 @@ def _recovery(protected: Flights, measure: str, paper: Printed) -> PaperCell:
     """Return the part of the worst case that a protection recovers, in per cent or in points.
 
     Args:
-        measure: attribute of `WorstCase`.
+        measure: name of an attribute of `WorstCase`.
     """
     value = PERCENT * getattr(protected.worst, measure)
     count = 0 if math.isnan(value) else len(protected.ratios)

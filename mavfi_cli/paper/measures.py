@@ -1,8 +1,9 @@
-"""Measures, which compute the number that decides a claim from flights or isolated kernels.
+"""Measures: functions that compute the number that decides a claim.
 
-claims.toml refers to them by name. A measure takes flights, and column values that select some of
-them. It counts only faults that flipped a bit. Missions with the same world and seed form a
-cluster, and the intervals of shares include the design effect of these clusters.
+claims.toml refers to them by name. A measure takes flights, isolated kernels or both. One that
+takes flights also takes column values that select some of them, and counts only faults that flipped
+a bit. Missions with the same world and seed form a cluster, and the intervals of shares include the
+design effect of these clusters.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ Where = Mapping[str, Any]  # values of columns; a tuple allows several
 Kernels = Mapping[str, IsolatedKernel]  # by name
 NOT_FLOWN = Finding(why="not flown")
 _DRAWS = 20_000  # posterior draws for a rank correlation
-_FEWEST = 5  # kernels for a rank correlation, and harmed missions for a share of them
+_FEWEST = 5  # minimum of kernels for a rank correlation, and of harmed missions for a share
 _DETECTORS = ("gad", "aad")
 
 
@@ -52,14 +53,14 @@ def _difference(shares: Sequence[Share], counts: str) -> Finding:
 
 
 def _harm_gap(groups: Mapping[str, Flights], what: str) -> Finding:
-    """Share of harmed missions in the first of two groups minus that in the second."""
+    """Return the share of harmed missions in the first of two groups minus that in the second."""
     shares = {name: _clustered(flights, "harmed") for name, flights in groups.items()}
     counts = "; ".join(f"{name} {share.counts}" for name, share in shares.items())
     return _difference([*shares.values()], f"{what}: {counts}")
 
 
 def _mean(flights: Flights, values: Sequence[float], counts: str) -> Finding:
-    """Average a value over clusters of flights; NaN is left out."""
+    """Average a value within each cluster of flights and then over clusters, ignoring NaN."""
     clusters: dict[tuple[str, int], list[float]] = {}
     for seed, value in zip(flights.seeds, values, strict=True):
         if not math.isnan(value):
@@ -77,18 +78,18 @@ def _mean(flights: Flights, values: Sequence[float], counts: str) -> Finding:
 
 
 def _golden_success(flights: Flights, **where: Any) -> Finding:
-    """Success of the golden flights."""
+    """Return the success rate of the golden flights."""
     return _of_share(
         _clustered(flights.golden.chosen(**where), value=False), "golden flights succeed"
     )
 
 
 def _delta_range(flights: Flights, state: str, why: str) -> Finding:
-    """Reduction of a state's range from its values to its deltas, mean over golden flights.
+    """Average 1 - (range of a state's deltas / range of its values) over the golden flights.
 
     Args:
         state: column of the trace.
-        why: the reason to give if there is no run folder.
+        why: the reason to give if no run folder was kept.
     """
     won = flights.golden.chosen(lost=False)
     reduced = []
@@ -107,7 +108,7 @@ def _delta_range(flights: Flights, state: str, why: str) -> Finding:
 
 
 def _success_lost(flights: Flights, **where: Any) -> Finding:
-    """Success of the golden flights minus that of the same missions with a fault."""
+    """Return the success rate of golden flights minus that of the same missions with a fault."""
     both = flights.struck(**where).chosen(own_lost=(True, False))
     if not len(both):
         return NOT_FLOWN
@@ -117,7 +118,7 @@ def _success_lost(flights: Flights, **where: Any) -> Finding:
 
 
 def _most_lost_kernel(flights: Flights, **where: Any) -> Finding:
-    """Success lost to faults in the kernel with the highest loss."""
+    """Return the success lost to faults in the kernel with the largest share of lost missions."""
     hit = flights.struck(**where).by("struck_kernel")
     kernels = {name: those.share().share for (name,), those in hit.items() if name}
     if not kernels:
@@ -129,19 +130,19 @@ def _most_lost_kernel(flights: Flights, **where: Any) -> Finding:
 
 
 def _harm_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
-    """Share of harmful faults in the first of two groups minus that in the second."""
+    """Return the share of harmful faults in the first of two groups minus that in the second."""
     return _harm_gap({name: flights.struck(**x) for name, x in groups.items()}, "harmful")
 
 
 def _harmful(flights: Flights, **where: Any) -> Finding:
-    """Share of harmful faults."""
+    """Return the share of harmful faults."""
     return _of_share(_clustered(flights.struck(**where), "harmed"), "harmful")
 
 
 def _loss_difference(
     flights: Flights, first: Where, second: Where, counts: str, **where: Any
 ) -> Finding:
-    """Share of lost missions in one group of faults minus that in another.
+    """Return the share of lost missions with the first group of faults minus that with the second.
 
     Args:
         counts: a format string for the counts of both groups.
@@ -151,7 +152,7 @@ def _loss_difference(
 
 
 def _longer(flights: Flights, **where: Any) -> Finding:
-    """Share of successful flights that take over LONGER times as long as their golden flights."""
+    """Return the share of successes that take over LONGER times as long as their golden flights."""
     timed = flights.struck(**where).timed.chosen(lost=False)
     ratios = timed.ratios
     if not len(ratios):
@@ -162,13 +163,13 @@ def _longer(flights: Flights, **where: Any) -> Finding:
 
 
 def _longer_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
-    """Difference between two groups in the share of successes that exceed LONGER."""
+    """Return the share of successes above LONGER in the first of two groups minus the second's."""
     timed = {name: flights.struck(**where).timed for name, where in groups.items()}
     return _harm_gap(timed, "over 10 % longer")
 
 
 def _mean_change(flights: Flights, column: str, *, ratio: bool = True, **where: Any) -> Finding:
-    """Mean change of a column from the golden flight of the same mission, where both succeed.
+    """Return a column's mean change from the golden to the faulty flight, where both succeed.
 
     Args:
         ratio: whether the change is relative.
@@ -184,7 +185,7 @@ def _mean_change(flights: Flights, column: str, *, ratio: bool = True, **where: 
 
 
 def _single_flight(flights: Flights, why: str, **where: Any) -> Finding:
-    """Report our longest flight but no effect, because one flight decides nothing."""
+    """Report our longest flight but no effect, because a single flight decides no claim."""
     ratios = flights.struck(**where).ratios
     if not len(ratios):
         return NOT_FLOWN
@@ -200,7 +201,7 @@ def _not_measured(_: Flights, why: str) -> Finding:
 
 
 def _net(seen: Flights, column: str, what: str) -> Finding:
-    """Share of harm that a detector undoes, minus the share that it causes, on the same faults."""
+    """Return (harm undone - harm caused) / harm without the detector, on the same faults."""
     seen = seen.where(value is not None for value in seen[f"bare_{column}"])
     seen = seen.where(value is not None for value in seen[column])
     if not len(seen):
@@ -215,12 +216,12 @@ def _net(seen: Flights, column: str, what: str) -> Finding:
 
 
 def _recovered(flights: Flights, detector: str, **where: Any) -> Finding:
-    """Share of lost missions that a detector saves, minus the share that it causes."""
+    """Return (missions saved - missions newly lost) / missions lost without the detector."""
     return _net(flights.protected(detector, **where), "lost", "lost")
 
 
 def _shortened(flights: Flights, detector: str, **where: Any) -> Finding:
-    """Share of longer flights that a detector shortens again, minus the share that it causes."""
+    """Return (long flights undone - long flights caused) / long flights without the detector."""
     seen = flights.protected(detector, **where).chosen(bare_lost=False, lost=False)
     return _net(seen, "harmed", f"over {100 * (LONGER - 1):.0f} % longer")
 
@@ -228,10 +229,10 @@ def _shortened(flights: Flights, detector: str, **where: Any) -> Finding:
 def _undone_difference(
     flights: Flights, detector: str, first: str, others: Sequence[str], **where: Any
 ) -> Finding:
-    """Net share of harm undone by watching some stages minus that by the best other choice.
+    """Return the net share of harm undone by watching `first` minus the largest among `others`.
 
     Args:
-        first, others: stages that the detector watches, joined by `+`.
+        first, others: sets of stages that the detector watches, each joined by `+`.
     """
     findings = {
         name: _net(flights.protected(detector, name, **where), "harmed", "harmful")
@@ -254,13 +255,13 @@ def _undone_difference(
 
 
 def _density_gap(flights: Flights, detector: str, dense: str, free: str, **where: Any) -> Finding:
-    """Share of protected missions harmed in a dense world minus that in a free one."""
+    """Return the share of protected missions harmed in a dense world minus that in a free one."""
     worlds = {name: flights.protected(detector, world=name, **where) for name in (dense, free)}
     return _harm_gap(worlds, "harmed with the detector")
 
 
 def _autoencoder_better(flights: Flights, **where: Any) -> Finding:
-    """Success with the autoencoder minus success with the Gaussian detector, on the same faults."""
+    """Return the success rate with AAD minus that with GAD, on the same faults."""
     seen = [flights.protected(name, **where) for name in _DETECTORS]
     gad, aad = (
         {
@@ -289,13 +290,13 @@ _NO_COSTS = Finding(why="this export does not hold these times; a new one does")
 def _overhead_of(
     flights: Flights, detector: str, parts: Collection[str] = COSTS, **where: Any
 ) -> Finding:
-    """Mean share of the flight time that parts of detection and recovery take."""
+    """Return the mean share of the flight time that parts of detection and recovery take."""
     seen, shares = _overheads(flights, detector, parts, where)
     return _costs(seen, shares, f"{len(seen):,} flights")
 
 
 def _gaussian_dearer(flights: Flights, **where: Any) -> Finding:
-    """Overhead of the Gaussian detector minus that of the autoencoder, on the same faults."""
+    """Return the overhead of GAD minus that of AAD, on the same faults."""
     gad, aad = (_overheads(flights, name, COSTS, where) for name in _DETECTORS)
     other = dict(zip(aad[0].faults, aad[1], strict=True))
     more = [
@@ -307,7 +308,7 @@ def _gaussian_dearer(flights: Flights, **where: Any) -> Finding:
 def _overheads(
     flights: Flights, detector: str, parts: Collection[str], where: Where
 ) -> tuple[Flights, FloatArray]:
-    """Return the flights with a detector, and the share of time in each; NaN if unknown."""
+    """Return the flights with a detector, and the share of time the parts take in each, or NaN."""
     seen = flights.struck(detector=detector, protect=EVERY_STAGE, **where)
     return seen, np.sum([seen.numbers(name) for name in parts], axis=0)
 
@@ -323,7 +324,7 @@ def _costs(seen: Flights, costs: Sequence[float] | FloatArray, counts: str) -> F
 def _outcome_beside(
     kernels: Kernels, kernel: str, outcome: str, extreme: str, others: Sequence[str] = ()
 ) -> Finding:
-    """Share of an outcome in one kernel minus that in the most extreme of the others.
+    """Return the share of an outcome in a kernel minus that in the most extreme other kernel.
 
     Args:
         extreme: `most` or `least`.
@@ -341,7 +342,7 @@ def _outcome_beside(
 
 
 def _least_benign(kernels: Kernels, but: str) -> Finding:
-    """Lowest share of benign runs among all kernels but one."""
+    """Return the lowest share of benign runs among all kernels except `but`."""
     shares = {name: kernels[name].outcomes["benign"] for name in kernels if name != but}
     if not shares:
         return NOT_FLOWN
@@ -350,14 +351,14 @@ def _least_benign(kernels: Kernels, but: str) -> Finding:
 
 
 def _benign(kernels: Kernels, kernel: str) -> Finding:
-    """Share of benign runs of a kernel."""
+    """Return the share of benign runs of a kernel."""
     if kernel not in kernels:
         return NOT_FLOWN
     return _of_share(kernels[kernel].outcomes["benign"], "benign")
 
 
 def _ranking(flights: Flights, kernels: Kernels, **where: Any) -> Finding:
-    """Spearman's correlation of silent corruption in isolation with harm in flight, over kernels.
+    """Correlate the SDC of isolated kernels with the harm of their faults in flight (Spearman).
 
     The kernels are fixed, not drawn, so the interval covers only the shares: each is drawn from its
     posterior distribution under Jeffreys' prior.

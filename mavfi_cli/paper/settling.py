@@ -1,7 +1,7 @@
 """Settles claims: flies missions for undecided claims until all are decided or time runs out.
 
 Every look judges all claims again, with tests that are valid at any look (`stats.sequences`). The
-next missions are for the claim that would be decided soonest if its effect stays as it is.
+next missions go to the claim that would be decided soonest if its effect stayed the same.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from mavfi_cli.paper.claims import judged
 from mavfi_cli.paper.items import BY_NAME, KERNELS_FOLDER, FlightsPlan, Source, key_of
 from mavfi_cli.paper.verdicts import Claim, FirstLook, Judgement, SettledClaim, Settling, Verdict
 
-BATCH = 10  # repetitions between two looks
-_MOST = 100_000  # most repetitions of a claim's missions
-_SEARCHED = 100  # repetitions that are searched at once
+BATCH = 10  # maximum number of repetitions between two looks
+_MOST = 100_000  # maximum number of repetitions of a claim's missions
+_SEARCHED = 100  # repetitions planned and searched at a time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,11 +39,11 @@ class _OpenClaim:
     """An undecided claim, and the missions that would decide it.
 
     Attributes:
-        judgement: its judgement so far.
-        kinds: kinds of missions that the claim counts.
-        missions, seconds: missions that would decide it if the effect stays as it is, and their
-            wall time; infinite if no number would.
-        repetition_s: wall time of one more repetition of its missions, s.
+        judgement: its judgement at the last look.
+        kinds: kinds of missions on which its effect depends.
+        missions, seconds: number of further missions that would decide it if its effect stayed the
+            same, and their wall time, s; infinite if no number would.
+        repetition_s: wall time of one more repetition of missions of these kinds, s.
     """
 
     claim: Claim
@@ -55,7 +55,7 @@ class _OpenClaim:
 
     @property
     def summary(self) -> str:
-        """Describe the missions that would decide the claim, in one line."""
+        """The number of missions that would decide the claim, and their wall time, in one line."""
         if math.isinf(self.missions):
             return f"{self.claim.name}: no number of missions decides it, if the effect stays"
         return (
@@ -65,16 +65,16 @@ class _OpenClaim:
 
 
 def require_settleable(plan: FlightsPlan) -> None:
-    """Refuse a list that cannot grow.
+    """Check that missions can be added to a plan.
 
     Raises:
-        ConfigError: the items have no missions, or the plan's path is an export.
+        ConfigError: no item of the plan flies missions, or the plan's path is an export.
     """
     if plan.out.suffix == ".parquet" or plan.folder.is_file():
-        raise ConfigError("the list of an export is frozen: no mission can be added", path=plan.out)
+        raise ConfigError("is an export, so no missions can be added", path=plan.out)
     if not any(item.source is Source.FLIGHTS for item in plan.items):
         names = ", ".join(item.name for item in plan.items)
-        raise ConfigError(f"must have an item that flies missions, got {names}", key="settle")
+        raise ConfigError(f"needs an item that flies missions, but got only {names}", key="settle")
 
 
 def settle(
@@ -88,11 +88,12 @@ def settle(
 
     Args:
         plan: a plan whose missions have been flown.
-        ledger: its ledger, open for writing.
-        hours: limit of wall time, h; None means no limit.
+        ledger: the plan's ledger, open for writing.
+        hours: limit on the wall time, h; None means no limit.
 
     Returns:
-        A line for each claim that was undecided: how it was decided, or that it is still undecided.
+        A line for each claim that was decided by added missions, with its verdict, and one for each
+        claim that is still undecided.
 
     Raises:
         MavfiError: a mission cannot be flown.
@@ -136,7 +137,7 @@ def settle(
 
 
 def _stored(ledger: Ledger, settling: Settling, look: _Look) -> Settling:
-    """Store what was flown, with the verdict on each claim."""
+    """Add the latest verdicts to `settling`, store it in the ledger, and return it."""
     claims = {
         name: replace(own, verdict=look.judgements[name].verdict.value)
         for name, own in settling.claims.items()
@@ -148,10 +149,10 @@ def _stored(ledger: Ledger, settling: Settling, look: _Look) -> Settling:
 
 
 class _Look:
-    """Judges the claims of a plan, and finds the missions that they count.
+    """Judges the claims of a plan's items, and finds the missions that would decide them.
 
     Attributes:
-        judgements: the judgement of every claim at the last look, by name.
+        judgements: judgement at the last look, by name of the claim.
     """
 
     def __init__(self, plan: FlightsPlan, jobs: int) -> None:
@@ -163,7 +164,7 @@ class _Look:
         self._kernels = {kernel.name: kernel for kernel in summary}
 
     def first(self, ledger: Ledger) -> dict[str, dict[str, FirstLook]]:
-        """Look at all claims before any mission is added."""
+        """Return the first look at every claim with an effect, by name of the claim and fate."""
         stack = self._plan.stack
         return {
             entry.claim.name: {
@@ -178,12 +179,12 @@ class _Look:
         }
 
     def _flown(self, table: pa.Table) -> Flights:
-        """Select the flights that claims count."""
+        """Select the flights of the plan's stack that claims use."""
         whole = Flights.of(table)
         return whole.chosen(stack=self._plan.stack, as_paper=True, at=(None, "random"))
 
     def open_claims(self, ledger: Ledger, settling: Settling) -> list[_OpenClaim]:
-        """Return the items' undecided claims that more missions may decide."""
+        """Judge the claims; return the items' undecided claims that more missions may decide."""
         stack = self._plan.stack
         table = flights(ledger)
         flown = self._flown(table)
@@ -263,7 +264,7 @@ def _fly(
     options: Options,
     spectator: Spectator,
 ) -> int:
-    """Fly further repetitions of a claim's missions; return their number."""
+    """Fly further repetitions of a claim's missions; return the number of these missions."""
     over = {number for number, _ in ledger.fates()}
     flown = {changes for number, _, _, changes in ledger.rows() if number in over}
     first = _first_missing(plan, entry, flown)
@@ -280,7 +281,7 @@ def _fly(
 
 
 def _first_missing(plan: FlightsPlan, entry: _OpenClaim, flown: Collection[str]) -> int:
-    """Return the first repetition with a mission that has not been flown."""
+    """Return the first repetition in which a mission of the claim is missing; at most _MOST."""
     item = BY_NAME[entry.claim.item]
     for first in range(0, _MOST, _SEARCHED):
         for mission, repetition in plan.numbered(item, first, first + _SEARCHED):
@@ -293,7 +294,7 @@ def _first_missing(plan: FlightsPlan, entry: _OpenClaim, flown: Collection[str])
 
 
 def _cost(still: Sequence[_OpenClaim], limit_s: float) -> list[str]:
-    """Describe the cost of deciding the open claims if all effects stay as they are."""
+    """Describe the wall time needed to decide the open claims if all effects stay the same."""
     if not still:
         return ["every claim that missions can decide is decided"]
     some = [entry for entry in still if not math.isinf(entry.seconds)]
@@ -319,7 +320,7 @@ def _undecided(entry: _OpenClaim) -> str:
 
 
 def _bounds(claim: Claim, judgement: Judgement) -> str:
-    """Describe the bounds of an effect, and whether they exclude the claim's size."""
+    """Describe an effect's bounds, and whether they exclude the claim's size, or why none exist."""
     effect, bounds = judgement.effect, judgement.bounds
     if effect is None or bounds is None:
         return f" ({judgement.why})"

@@ -1,4 +1,4 @@
-"""Finds campaigns, exported campaigns and attacked kernels in files and folders."""
+"""Reads campaigns, exports and summaries of isolated kernels from files and folders."""
 
 from __future__ import annotations
 
@@ -30,19 +30,20 @@ _OTHERS = ("trace.parquet", "plans.parquet", "kernels.parquet")  # not exports
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignSource:
-    """A campaign, from its folder or from an export.
+    """A campaign that was read from its folder or from an export.
 
     Attributes:
         path: the campaign's folder, or the exported file.
-        spec: None if a program made the list, or if there is no specification next to an export.
+        spec: its specification; None if a program made the list of missions, or if an export has
+            neither a specification next to it nor a preset of its name.
         planned: number of missions on its list; None if an export does not record it.
         flights: the flown missions.
         errors: missions that could not begin.
-        versions: versions of the programs that flew it; empty if an export does not record them.
+        versions: versions of the software that flew it; empty if an export does not record them.
         host: host of the first record; empty if an export does not record it.
         digest: SHA-256 of an exported file; empty for a folder.
         settling: the missions flown to settle claims; None if there were none.
-        again: command that flies the rest of its list; empty if unknown.
+        again: command that flies its missing missions; empty if unknown.
     """
 
     path: Path
@@ -59,7 +60,7 @@ class CampaignSource:
 
     @property
     def may_have_runs(self) -> bool:
-        """Whether run folders may be read; an export could name anyone's folders."""
+        """Whether run folders may be read. Paths in an export are not trusted."""
         return self.path.is_dir()
 
     @property
@@ -89,13 +90,13 @@ class Evidence:
 
     @classmethod
     def gather(cls, places: Sequence[Path]) -> Evidence:
-        """Read all campaigns and summaries at the places.
+        """Read all campaigns and kernel summaries at the given paths.
 
         Args:
             places: exports, and folders with campaigns or results of `mavfi kernels` at any depth.
 
         Raises:
-            RecordError: a place does not exist, or nothing there can be read.
+            RecordError: a path does not exist, or no path has a flown mission or a kernel summary.
         """
         campaigns: list[CampaignSource] = []
         kernels: list[KernelSummary] = []
@@ -126,12 +127,12 @@ class Evidence:
 
     @property
     def isolated(self) -> Mapping[str, IsolatedKernel]:
-        """The summary of each attacked kernel, from the last source that has one."""
+        """The summary of each isolated kernel, by name, from the last source that has it."""
         return {kernel.name: kernel for source in self.kernels for kernel in source.kernels}
 
     @property
     def settled(self) -> Mapping[str, Settling]:
-        """The missions flown to settle claims, by stack, from the last source that has them."""
+        """The missions flown to settle claims, by stack, from the last campaign that has any."""
         return {
             stack: source.settling
             for source in self.campaigns
@@ -140,12 +141,12 @@ class Evidence:
         }
 
     def flights(self, stack: str | None = None) -> Flights:
-        """Return the flights of a stack (None: all stacks), each mission once."""
+        """Return the flights of a stack, or of all stacks if None, without duplicate missions."""
         return Flights.pooled([campaign.flights for campaign in self.campaigns], stack)
 
 
 def _paths_in(place: Path) -> Iterator[Path]:
-    """Yield the ledgers, kernel summaries and exports at a place, sorted by path."""
+    """Yield the ledgers, kernel summaries and exports in a folder, sorted, or a file itself."""
     if not place.exists():
         raise RecordError(f"{place}: does not exist")
     if place.is_file():
@@ -161,7 +162,7 @@ def _paths_in(place: Path) -> Iterator[Path]:
 
 
 def _inside_campaign(path: Path, place: Path) -> bool:
-    """Return True for a path in a campaign's subfolders, such as kept runs or a world search."""
+    """Return True if a path lies in a subfolder of a campaign, such as that of a kept run."""
     above = [folder for folder in path.parent.parents if folder.is_relative_to(place)]
     return any((folder / LEDGER).is_file() for folder in above)
 
@@ -202,14 +203,18 @@ def _campaign(
         parts = value.values() if isinstance(value, Mapping) else ()
         nested = any(isinstance(part, (Mapping, list)) for part in parts)
         if nested or not isinstance(value, _ORIGIN[name]):
-            raise RecordError(f"{path}: {name!r} of its provenance is damaged")
+            raise RecordError(f"{path}: the provenance field {name!r} is damaged")
     more["settling"] = Settling.of(origin.get(SETTLING))
     more |= {"flights": Flights.of(table), "errors": errors}
     return CampaignSource(path=path, spec=spec, **known, **more)
 
 
 def _spec_beside(path: Path) -> Spec | None:
-    """Load an export's specification: NAME.toml, also for NAME-part1.parquet, or the preset."""
+    """Load an export's specification: NAME.toml next to it, or else the preset NAME.
+
+    NAME is the export's file name without its suffix, or also without `-part` and what follows.
+    Return None if there is neither.
+    """
     for stem in (path.stem, path.stem.rpartition("-part")[0]):
         if stem and (beside := path.with_name(stem + _SPEC)).is_file():
             return load_spec(str(beside))
@@ -234,7 +239,7 @@ def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
 
 
 def _unpaired(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
-    """Report flights without golden flights, and campaigns without flights like the paper's."""
+    """Report faulty flights without golden flights, and campaigns with no paper-like flight."""
     pooled = Flights.pooled([source.flights for source in campaigns])
     paired = {
         changes

@@ -1,4 +1,4 @@
-"""A campaign compared with the paper: the tables of its items, and its state on one screen."""
+"""Tables that compare a campaign with the paper, and the campaign's state on one screen."""
 
 from __future__ import annotations
 
@@ -33,22 +33,23 @@ from mavfi_cli.vpm.model import ModelVehicle, schemes_with
 from mavfi_cli.vpm.report import Choices, report
 
 _ROWS = 14  # rows of a table on one screen
-_WIDE = 2  # columns of settings on one screen
-_DEVIATION = "SD of time, s"  # of flights that do not repeat; also shown on one screen
+_WIDE = 2  # columns of the table of settings on one screen
+_DEVIATION = "SD of time, s"  # if flights are not repeatable; also kept on one screen
 _SETTINGS = "settings"  # name of the table of a user's own campaign
 
 
 def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, Flights | None]:
-    """Return the main table of a campaign, and the flights for its figure; None if it needs none.
+    """Return the main table of a campaign, and the flights that its figure needs, or None.
 
-    This is the table of the named item, or else of the preset's item. In an export, any item with
-    flights may be named. Without an item, it is the table of items for a reproduction, and the
-    table of settings for any other campaign.
+    The table is that of the named item or, without a name, of the preset's item. Without either, or
+    for a stratified campaign without a name, it lists the items of a reproduction, or the settings
+    of any other campaign. In a reproduction or an export, any item may be named.
 
     Raises:
         UnknownName: the campaign has no item of this name.
-        ConfigError: the item of the paper is not an experiment.
-        RecordError: the kernels were not run, or an export contains no flight of the item.
+        ConfigError: the named figure or table of the paper is not an experiment.
+        RecordError: the kernels were not run, or an export contains no flights for the item or
+            those of several stacks.
     """
     item, plan = _item_of(ledger, name), FlightsPlan.stored(ledger)
     if item is None or (ledger.stratified and name is None):
@@ -66,19 +67,19 @@ def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, Flights 
 
 
 def _of_export(item: Item, flights: Flights, path: Path) -> Flights:
-    """Select an item's flights from an export by their kind, because an export holds no plan."""
+    """Select an item's flights from an export by their kinds, since an export has no plan."""
     parts = [of_kind(item, stack, flights.chosen(stack=stack)) for stack in set(flights["stack"])]
     flown = [part for part in parts if len(part)]
     if len(flown) > 1:
-        raise RecordError(f"{path}: holds {item.paper} on several stacks; export each one alone")
+        raise RecordError(f"{path}: has {item.paper} on several stacks; export each separately")
     if not flown:
-        raise RecordError(f"{path}: holds no flight like those of {item.paper}")
+        raise RecordError(f"{path}: contains no flights for {item.paper}")
     return flown[0]
 
 
 def _item_of(ledger: Ledger, name: str | None) -> Item | None:
-    """Return the named item of a campaign, or its preset's item; None if the paper has none."""
-    preset = (ledger.meta("name") or "").partition("-")[0]  # with or without changes
+    """Return the named item or, without a name, the item of the campaign's preset, or None."""
+    preset = (ledger.meta("name") or "").partition("-")[0]  # without the suffix for changes
     own = [item for item in ITEMS if item.preset == preset] if preset in PRESETS.names else []
     if name is None:
         return min(own, key=lambda item: item.name != preset, default=None)
@@ -97,7 +98,7 @@ def _flights_of(item: Item, plan: FlightsPlan, flights: Flights) -> Flights:
 
 
 def tables(plan: FlightsPlan) -> Iterator[PaperTable]:
-    """Yield the table of each item of a plan, from the flights and runs that exist.
+    """Yield the table of each item of a plan, from the flights and kernel runs done so far.
 
     Raises:
         RecordError: nothing was flown, or the kernels were not run.
@@ -123,12 +124,12 @@ def _unflown(item: Item, out: Path) -> PaperTable:
         return of_model()
     path = out / KERNELS_FOLDER / KERNELS
     if not path.is_file():
-        raise RecordError(f"{path.parent}: no runs of kernels (mavfi reproduce fig6)")
+        raise RecordError(f"{path.parent}: contains no kernel runs (mavfi reproduce fig6)")
     return of_kernels(KernelSummary.read(path).kernels)
 
 
 def of_kernels(kernels: Iterable[IsolatedKernel]) -> PaperTable:
-    """Return the table of Fig. 6."""
+    """Return the table of Fig. 6, from runs of isolated kernels."""
     rows = []
     for kernel in kernels:
         paper = printed("fig6", "benign_percent", _PAPER_KERNELS.get(kernel.name, kernel.name))
@@ -232,7 +233,7 @@ def _progress_table(ledger: Ledger, plan: FlightsPlan) -> PaperTable:
 
 
 def short(table: PaperTable) -> PaperTable:
-    """Cut a table to one screen: its first rows, and the first columns of a table of settings."""
+    """Cut a table to one screen: keep its first rows and, if it lists settings, first columns."""
     titles = [column.title for column in table.columns]
     wide = _WIDE + (_DEVIATION in titles) if table.name == _SETTINGS else len(titles)
     left = [title.partition(",")[0] for title in titles[wide:]]
@@ -248,7 +249,7 @@ def short(table: PaperTable) -> PaperTable:
 
 
 def progress_lines(ledger: Ledger) -> list[str]:
-    """Return lines about the progress, and the time left at the pace so far."""
+    """Describe a campaign's progress, and the time left at the pace so far, in a few lines."""
     planned, over = ledger.planned(), ledger.over()
     errors = sum(ledger.errors_by_cell().values())
     name = ledger.meta("name") or ledger.folder.name

@@ -1,4 +1,4 @@
-"""Claims and their verdicts, which compare an effect with the range of a claim.
+"""The claims, and the verdicts that compare a claim's effect with its range.
 
 The ranges in claims.toml were written before the data existed. A verdict tests the effect against
 the nearest end of the range. The tests of one figure or table form a family, corrected by Holm's
@@ -23,15 +23,15 @@ from mavfi_cli.stats.sequences import anytime_count, anytime_interval, anytime_p
 from mavfi_cli.stats.shares import Interval, wilson, z_of
 
 ISOLATED = "isolated kernels"
-LEVEL = 0.05  # of a family
-_FAMILY = 4  # claims of a figure or table that `margin` allows for
+LEVEL = 0.05  # significance level of a family of tests
+_FAMILY = 4  # number of claims per figure or table that `margin` assumes
 _HALVES = 2  # of the level: one for the first look, one for all looks together
 _STEP = 0.005  # margins are multiples of half a point
 _Z = z_of(1.0 - LEVEL)
 
 
 class Verdict(Enum):
-    """The verdict of the missions on a claim."""
+    """Whether the missions and runs reproduce a claim."""
 
     REPRODUCED = "reproduced"
     CONTRADICTED = "contradicted"
@@ -65,9 +65,10 @@ class Judgement:
         p: p-value of the test against the nearest end of the range, corrected for its family; 1
             without an effect.
         p_alone: p-value of the same test without a correction for its family or for looks.
-        needed: number of observations that would decide an undecided claim if the effect stays as
-            it is; infinite if it lies on an end of the range.
-        bounds: the 95 % interval that holds at all looks together; None if nothing was settled.
+        needed: number of observations that would decide an undecided claim if the effect stayed the
+            same; infinite if the effect lies on an end of the range; 0 for other verdicts.
+        bounds: 95 % interval of the effect that is valid at all looks together; None if no missions
+            were added to settle claims.
         without_size: whether the bounds exclude an effect of the claim's size on either side of 0:
             two one-sided tests (D. J. Schuirmann, J. Pharmacokinetics and Biopharmaceutics 15,
             1987).
@@ -88,16 +89,16 @@ class Judgement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claim:
-    """A claim of the paper, as claims.toml explains.
+    """A claim of the paper; claims.toml explains the fields that are not listed here.
 
     Attributes:
         item: table, figure or section, such as `fig6`.
         find: function that computes the finding from a stack's flights and the isolated kernels.
         low, high: ends of the range of the effect.
-        size: the size of the effect that the paper states; None without one.
-        rule: the range, and where it comes from, in words.
-        isolated: whether it is about isolated kernels instead of flights.
-        fates: possible effects of the faults on their nodes; each fate is judged separately.
+        size: size of the effect in the paper; None if the paper states none.
+        rule: the range and its origin, in words.
+        isolated: whether the claim is about isolated kernels instead of flights.
+        fates: fates of faults for which the claim is judged separately.
     """
 
     name: str
@@ -122,7 +123,7 @@ class JudgedClaim:
     """A claim with its verdicts.
 
     Attributes:
-        judgements: judgement for each stack or ISOLATED, by the effect of faults on their nodes.
+        judgements: judgements by stack or ISOLATED, and then by the fate of the faults.
     """
 
     claim: Claim
@@ -139,7 +140,7 @@ class FirstLook:
     """The test of a claim before any mission was added to settle it.
 
     Attributes:
-        p: p-value of the claim alone.
+        p: p-value without a correction for the claim's family.
         inside: whether the effect lay in the claim's range.
     """
 
@@ -149,12 +150,12 @@ class FirstLook:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SettledClaim:
-    """The missions that were flown for one claim.
+    """The missions that were flown to settle one claim.
 
     Attributes:
-        looks: number of looks after missions that were flown for this claim.
+        looks: number of looks that followed missions flown for this claim.
         missions: number of those missions; other claims use them as well.
-        seconds: wall time that they took, s.
+        seconds: wall time of those missions, s.
         verdict: the verdict at the last look.
     """
 
@@ -166,10 +167,12 @@ class SettledClaim:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settling:
-    """All claims for which missions were flown, and the number of all looks.
+    """The record of the looks at claims, and of the missions flown to settle them.
 
     Attributes:
-        first: the first look at each claim that had an effect, by claim and by the fate of faults.
+        first: first look at each claim that had an effect then, by name and fate of the faults.
+        looks: number of looks that followed missions flown for any claim.
+        claims: missions flown for each claim, by name; absent if there were none.
     """
 
     first: Mapping[str, Mapping[str, FirstLook]] = field(default_factory=dict)
@@ -178,10 +181,10 @@ class Settling:
 
     @classmethod
     def of(cls, stored: Any) -> Self | None:
-        """Read a stored value, which may be damaged; None if nothing was settled.
+        """Parse a stored value, as JSON text or as its contents; None if nothing was settled.
 
         Raises:
-            ConfigError: the value has another form.
+            ConfigError: the contents do not have the expected structure.
         """
         if stored is None:
             return None
@@ -196,7 +199,7 @@ class Settling:
         return self.first.get(name, {}).get(fate)
 
     def describe(self, name: str) -> str:
-        """Describe what was flown for a claim."""
+        """Describe the missions that were flown to settle a claim."""
         claim = self.claims.get(name)
         if claim is None:
             return "no mission was added for it"
@@ -214,14 +217,15 @@ def judge(
     """Judge a family of claims.
 
     If missions were added to settle claims, half of the level is spent on the first look, whose
-    number of missions was planned, and half on all looks together. So a p-value is twice the
-    smaller of the p-value at the first look and `anytime_p`.
+    number of missions was planned, and half on all looks together. A p-value is then twice the
+    smaller of `anytime_p` and the p-value at the first look. The latter counts only if the effect
+    has moved neither into the range nor out of it since then.
 
     Args:
         findings: finding of each claim.
         ranges: low and high end of each claim's range, both inclusive.
-        first: first look at each claim, None for a claim without an effect then; None if no
-            missions were added.
+        first: first look at each claim, or None for a claim that had no effect then. The whole
+            argument is None if no missions were added.
     """
     z = [_z(finding.effect, *ends) for finding, ends in zip(findings, ranges, strict=True)]
     tested = [place for place, value in enumerate(z) if not math.isnan(value)]
@@ -267,9 +271,10 @@ def judge(
 
 
 def _z(effect: Interval | None, low: float, high: float) -> float:
-    """Return the standard errors from the effect to the nearest end; NaN without an interval.
+    """Return the distance from an effect to the nearest end of its range, in standard errors.
 
-    The standard error comes from the side of the interval that faces the end.
+    The standard error is that of the interval's side that faces the end. The result is NaN without
+    an interval.
     """
     if effect is None or math.isnan(effect.low) or math.isnan(effect.high):
         return math.nan
@@ -298,11 +303,11 @@ def _two_sided(z: float) -> float:
 
 
 def margin(missions: int) -> float:
-    """Return the smallest effect that counts, given the size of each of the paper's groups.
+    """Return the smallest effect that counts, for groups of the paper's number of missions.
 
-    A result of 0 in that many missions rules it out in a family of four claims, so that a claim can
-    be contradicted. It is the upper end of Wilson's interval for 0 of n at confidence 1 - 0.05/4,
-    rounded up to half a point.
+    A rate of 0 in that many missions rules this effect out in a family of four claims, so a claim
+    of such an effect can be contradicted. The effect is the upper end of Wilson's interval for 0 of
+    n at confidence 1 - 0.05/4, rounded up to half a point.
     """
     high = wilson(0, missions, confidence=1.0 - LEVEL / _FAMILY).high
     return math.ceil(high / _STEP) * _STEP

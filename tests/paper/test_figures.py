@@ -139,5 +139,5 @@ def test_faults_by_place_need_a_fault(name):
 
 
 def test_trajectories_need_a_kept_run():
-    with pytest.raises(RecordError, match="no run folder was kept"):
+    with pytest.raises(RecordError, match="run folders, but none were kept"):
         DRAWN["fig13"](FLIGHTS, "one")

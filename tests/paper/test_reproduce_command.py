@@ -148,7 +148,7 @@ def test_bad_reports_are_one_line(folder, mavfi, tmp_path):
         (("--item", "fig2"), "is not an experiment"),
         (("--item", "fig9", "--output", "x.jpg"), ".svg, .pdf or .png"),
         (("--item", "fig9", "--output", tmp_path / "no/x.png"), "its folder does not exist"),
-        (("--item", "fig6"), "no runs of kernels"),
+        (("--item", "fig6"), "no kernel runs"),
     ):
         run = mavfi("campaign", "report", folder, *arguments)
         assert (run.returncode > 0, run.stdout) == (True, "")

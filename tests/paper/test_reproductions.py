@@ -204,7 +204,7 @@ def test_other_versions_are_refused(copied, tmp_path):
 def test_a_full_disk_is_told_before_the_flights(tmp_path, monkeypatch):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(flying.shutil, "disk_usage", lambda place: usage(1000, 1000, 0))
-    with pytest.raises(RecordError, match="GB are free"):
+    with pytest.raises(RecordError, match="GB is free"):
         flown(plan(tmp_path, "fig16"))
     assert over(plan(tmp_path)) == 24  # which the forecast is from
 
@@ -226,7 +226,7 @@ def test_an_export_has_the_items_whose_flights_it_holds(tmp_path):
         table, flights = shown(ledger, "table4")
         assert len(flights) == 2
         assert [line.count for line in table.rows] == ["1", "1", "0", "0"]
-        with pytest.raises(RecordError, match=r"no flight .*Table III"):
+        with pytest.raises(RecordError, match=r"no flights .*Table III"):
             shown(ledger, "table3")
 
 
@@ -241,7 +241,7 @@ def test_an_export_without_pairs_has_a_note_and_no_effect(tmp_path):
 def test_golden_flights_alone_are_no_item_with_faults(tmp_path):
     with (
         exported(tmp_path, [in_dense()]) as ledger,
-        pytest.raises(RecordError, match=r"no flight .*Fig\. 14"),
+        pytest.raises(RecordError, match=r"no flights .*Fig\. 14"),
     ):
         shown(ledger, "fig14")
 

@@ -105,7 +105,7 @@ def test_an_export_with_damaged_builds_is_told_and_the_rest_is_used(campaign, tm
     found = Evidence.gather([tmp_path])
     assert [source.name for source in found.campaigns] == ["whole"]
     (problem,) = found.problems
-    assert "odd: 'versions' of its provenance is damaged" in problem
+    assert "odd: the provenance field 'versions' is damaged" in problem
 
 
 def test_an_export_that_names_no_build_is_told(tmp_path):
