@@ -493,7 +493,7 @@ def replay_runs(
     for target in _targets(plan, folder, kernels, program):
         name = (target.stream or (None,))[0]
         entries = [entry for entry in read_runs(folder) if entry.get("kernel") == name]
-        records = [entry for entry in entries if entry["trigger"]]
+        records = [entry for entry in entries if entry.get("trigger") != []]
         if not records:
             continue
         repeated = True
@@ -504,7 +504,10 @@ def replay_runs(
                 image = places[0].image(tracee)
             for entry in records[: runs or None]:
                 record.require_same_build(entry, image)
-                yield _replay(attackers[entry.get("input", 0)], entry)
+                number = entry.get("input", 0)
+                if not 0 <= number < len(attackers):
+                    raise RecordError(f"{folder}: a run has no input {number}")
+                yield _replay(attackers[number], entry)
     if not repeated:
         raise RecordError(f"{folder}: holds no repeatable runs")
 
@@ -548,7 +551,7 @@ def _targets(
 def _replay(attacker: Attacker, entry: FaultRecord) -> _Replay:
     again = attacker.run(record.fault_of(entry)).completed(entry)
     differs = [name for name in _COMPARED if again.get(name) != entry.get(name)]
-    was, now = entry["injection"], again["injection"]
+    was, now = entry.get("injection", {}), again["injection"]
     differs += [name for name in _INJECTION if now.get(name) != was.get(name)]
     return _Replay(
         target=attacker.place.name, run=entry["run"], differs=tuple(differs), record=again

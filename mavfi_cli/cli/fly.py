@@ -321,6 +321,8 @@ def _replaced(base: MissionConfig, given: Given) -> MissionConfig:
     )
     if fault is not None and fault.persistence == "transient" and not fault.killed_node:
         refuse_given({"duration_s"}, "needs --persistence stuck-at or intermittent")
+    if fault is not None:
+        _refuse_unused_bits(fault)
     if not (instruction or mission.isolate or (fault is not None and fault.killed_node)):
         refuse_given({"node_restart_s"}, _DYING)
     mission.loaded_stack()
@@ -331,6 +333,16 @@ def _replaced(base: MissionConfig, given: Given) -> MissionConfig:
     elif fault is not None and fault.attacks_detector:
         raise click.UsageError(f"--inject {fault.target} needs --detector NAME")
     return mission
+
+
+def _refuse_unused_bits(fault: FaultConfig) -> None:
+    """Raise UsageError if an option chooses bits that the fault does not flip."""
+    if fault.effect != "flip":
+        refuse_given({"bits", "field", "exact_bits"}, f"has no effect with --effect {fault.effect}")
+    if fault.exact_bits:
+        refuse_given({"bits", "field"}, "has no effect with --bit, which names the bits")
+        if len(set(fault.exact_bits)) < len(fault.exact_bits):
+            raise click.UsageError("--bit must not name a bit twice")
 
 
 def _faults(

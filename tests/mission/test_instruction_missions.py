@@ -4,6 +4,7 @@ import json
 import os
 import pickle
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -28,7 +29,7 @@ from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.machine import OK, check_tracing
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
-from mavfi_cli.mission.run_folder import load_run
+from mavfi_cli.mission.run_folder import RunFolder, load_run
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
@@ -155,6 +156,24 @@ def test_a_record_of_another_build_is_refused(repeat):
 
     with pytest.raises(BuildMismatch, match=r"numba:track .* sha256:0"):
         repeat(other)
+
+
+@traced
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("build_ids", None), ("build_ids", "theirs"), ("trigger", [{"offset": "64"}]),
+        ("corruption", {"register": "x"}), ("node", "theirs"), ("node", []), ("kernel", {}),
+        ("stamp_s", "theirs"), ("request", []), ("windows", None),
+    ],
+)  # fmt: skip
+def test_a_damaged_record_is_refused_in_one_line(name, value, attacked, mavfi, tmp_path):
+    folder = RunFolder(Path(shutil.copytree(attacked.path, tmp_path / "theirs")))
+    recorded = json.loads(folder.fault.read_text())
+    folder.fault.write_text(json.dumps(recorded | {name: value}))
+    done = mavfi("replay", folder.path, "--out", tmp_path / "again")
+    (error,) = [line for line in done.stderr.splitlines() if not line.startswith("flying ")]
+    assert (done.returncode, error[:7]) == (1, "error: ")
 
 
 @pytest.mark.slow

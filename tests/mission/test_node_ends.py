@@ -245,7 +245,7 @@ def test_nodes_that_share_a_process_take_turns_and_end_together(executor_of):
     assert [loss.node for loss in executor.losses] == ["check"]
 
 
-def test_a_kill_loses_the_work_under_way_and_what_waits(executor_of):
+def test_a_kill_loses_the_work_under_way_and_a_newer_input_replaces_what_waits(executor_of):
     executor = executor_of("a")
     executor.isolate("a")
     executor.submit("a", "under way")

@@ -8,27 +8,30 @@ partial one.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
-from mavfi_cli.core.errors import BuildMismatch, RecordError, lack_of
+from mavfi_cli.core.config import structure_record
+from mavfi_cli.core.errors import BuildMismatch, RecordError
 from mavfi_cli.core.files import Json, read_json, write_text
 from mavfi_cli.core.flight_record import SCHEMA
 from mavfi_cli.fi.tracer.counted import CountedStop, Detour
 from mavfi_cli.fi.tracer.fault import (
     InstructionCorruption,
     InstructionFault,
-    Role,
     Site,
 )
 from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.fi.tracer.inject import Followed, Injection
 from mavfi_cli.fi.tracer.record_fields import FaultRecord, StageRecord
+from mavfi_cli.fi.tracer.registers import width_of
 
 VERSION = 2  # version 1 had whole registers as operands
 _LARGEST = 1 << 24  # bytes of a record
+_LARGEST_OFFSET, _LARGEST_COUNT = 1 << 40, 1 << 48
+_LONGEST_DETOUR = 127  # bytes
+_WIDEST_OPERAND, _MOST_OPERANDS = 8192, 8  # bits of an opcode or in memory; memory operands
 
 
 def planned(
@@ -125,37 +128,94 @@ def describe(written: FaultRecord) -> str:
     return f"fault in {where}: bit {bits} of {corruption['role']} {what}, {activation}"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Stage:
+    """One stage of a recorded trigger."""
+
+    object: str
+    offset: int
+    count: int
+    detour: Detour | None = None
+
+    def stop(self) -> CountedStop:
+        """Return the stage of the trigger. Raises ValueError if a number is out of its range."""
+        _require_range("offset", self.offset, 0, _LARGEST_OFFSET)
+        _require_range("count", self.count, 1, _LARGEST_COUNT)
+        if self.detour is not None:
+            _require_range("detour.size", self.detour.size, 1, _LONGEST_DETOUR)
+            _require_range("detour.via", abs(self.detour.via), 0, _LONGEST_DETOUR)
+        return CountedStop(Location(self.object, self.offset), self.count, self.detour)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Repeatable:
+    """The entries of a record from which its fault is repeated and compared."""
+
+    trigger: tuple[_Stage, ...]
+    k: int
+    instruction: str
+    instruction_bytes: str
+    corruption: InstructionCorruption | None
+    build_ids: dict[str, str | None]
+    injection: dict[str, Any] = field(default_factory=dict)
+    run: int = 0
+    input: int = 0
+
+    @classmethod
+    def of(cls, record: FaultRecord) -> _Repeatable:
+        """Read the entries.
+
+        Raises:
+            RecordError: the record is damaged or has another version.
+        """
+        if record.get("version") != VERSION:
+            raise RecordError(f"not a fault record of version {VERSION}")
+        try:
+            read = structure_record(record, cls)
+            if read.corruption is not None:
+                _require_bits(read.corruption)
+            if not read.trigger:
+                raise ValueError("its trigger is empty")
+        except ValueError as error:
+            raise RecordError(f"the fault record is damaged: {error}") from None
+        return read
+
+
+def _require_range(name: str, value: int, low: int, high: int) -> None:
+    if not low <= value <= high:
+        raise ValueError(f"{name} must be between {low} and {high}, got {value}")
+
+
+def _require_bits(corruption: InstructionCorruption) -> None:
+    """Raise ValueError if a register does not exist, or a bit or an operand is out of range."""
+    width = _WIDEST_OPERAND
+    if corruption.site not in (Site.MEMORY, Site.OPCODE):
+        try:
+            width = width_of(corruption.register)
+        except KeyError:
+            raise ValueError(f"there is no register {corruption.register!r}") from None
+    for bit in corruption.bits:
+        _require_range("corruption.bits", bit, 0, width - 1)
+    _require_range("corruption.memory_operand", corruption.memory_operand, 0, _MOST_OPERANDS - 1)
+
+
 def fault_of(record: FaultRecord) -> InstructionFault:
     """Return the fault that a record describes, so that it can be repeated.
 
     Raises:
         RecordError: the record is damaged or has another version.
     """
-    if record.get("version") != VERSION:
-        raise RecordError(f"not a fault record of version {VERSION}")
+    read = _Repeatable.of(record)
     try:
-        corruption = record["corruption"]
         return InstructionFault(
-            trigger=tuple(
-                CountedStop(
-                    Location(stage["object"], stage["offset"]),
-                    stage["count"],
-                    Detour(**stage["detour"]) if "detour" in stage else None,
-                )
-                for stage in record["trigger"]
-            ),
-            execution=record["k"],
-            instruction=record["instruction"],
-            instruction_bytes=bytes.fromhex(record["instruction_bytes"]),
-            corruption=None if corruption is None else _corruption_of(corruption),
+            trigger=tuple(stage.stop() for stage in read.trigger),
+            execution=read.k,
+            instruction=read.instruction,
+            instruction_bytes=bytes.fromhex(read.instruction_bytes),
+            corruption=read.corruption,
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise RecordError(f"the fault record is damaged: {lack_of(error)}") from None
-
-
-def _corruption_of(data: Mapping[str, Any]) -> InstructionCorruption:
-    converted = {"site": Site(data["site"]), "role": Role(data["role"]), "bits": (*data["bits"],)}
-    return InstructionCorruption(**{**data, **converted})
+    except ValueError as error:
+        raise RecordError(f"the fault record is damaged: {error}") from None
 
 
 def require_same_build(record: FaultRecord, image: Image) -> None:
@@ -164,9 +224,10 @@ def require_same_build(record: FaultRecord, image: Image) -> None:
     Raises:
         BuildMismatch: an object is missing or of another build; the message names all such
             objects.
+        RecordError: as `fault_of`.
     """
     differences = []
-    for name, build_id in record["build_ids"].items():
+    for name, build_id in _Repeatable.of(record).build_ids.items():
         loaded = image.find(name)
         if loaded is None:
             differences.append(f"{name} is not loaded")

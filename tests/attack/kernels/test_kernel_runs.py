@@ -129,6 +129,25 @@ def test_runs_of_other_code_are_not_replayed(control_copy):
         list(replay_runs(control_copy))
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "problem"),
+    [
+        ("build_ids", None, "build_ids: must be a table"),
+        ("trigger", None, "trigger: must be an array"),
+        ("corruption", {"register": "x"}, "it has no corruption.site"),
+        ("injection", "theirs", "injection: must be a table"),
+        ("input", "theirs", "input: must be a whole number"),
+        ("input", 99, "a run has no input 99"),
+        ("run", [0], "holds no repeatable runs"),  # the line is skipped, as an incomplete one is
+    ],
+)
+def test_a_damaged_run_is_not_replayed(name, value, problem, control_copy):
+    line = json.loads((control_copy / "runs.jsonl").read_text().splitlines()[0])
+    (control_copy / "runs.jsonl").write_text(json.dumps(line | {name: value}) + "\n")
+    with pytest.raises(RecordError, match=problem):
+        list(replay_runs(control_copy, ("control",)))
+
+
 def test_nothing_to_replay_is_an_error(tmp_path):
     with pytest.raises(RecordError, match=r"plan\.json"):
         list(replay_runs(tmp_path))

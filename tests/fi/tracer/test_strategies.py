@@ -171,7 +171,7 @@ def test_a_record_names_the_inverted_jump_and_gives_it_back():
     assert (told["inverts"], told["bits"]) == ("jle", [6, 7])
     entry = {
         "version": record.VERSION, "trigger": [{"object": "a", "offset": 0, "count": 1}], "k": 1,
-        "instruction": "cmp", "instruction_bytes": CMP, "corruption": told,
+        "instruction": "cmp", "instruction_bytes": CMP, "corruption": told, "build_ids": {},
     }  # fmt: skip
     assert record.fault_of(entry).corruption == corruption
     assert "inverts" not in struck(CMP, JE, count=1)[0].to_json()
