@@ -62,7 +62,7 @@ def chosen(
     programs: Sequence[str | None] = (),
     sampling: Sampling | None = None,
     *,
-    many_worlds: bool = False,
+    worlds: str | None = None,
 ) -> tuple[Spec, Path]:
     """Find the named campaign and its folder.
 
@@ -75,15 +75,14 @@ def chosen(
         programs: programs that a folder's missions may name; see
             `MissionConfig.require_programs`.
         sampling: how faults are drawn; None means as specified. This becomes part of the name too.
-        many_worlds: replace the fixed worlds by a new world for each seed. This becomes part of the
-            name too.
+        worlds: `fixed` or `many`, as in `Spec.in_worlds`; None means as specified.
 
     Raises:
         ConfigError: the specification or the scale is invalid, or `out` is None and the name is
             that of both a preset and a campaign's folder in the working directory.
         UnknownName: no preset, file or folder has this name.
     """
-    spec = chosen_spec(what, scale, changes, out, programs, sampling, many_worlds=many_worlds)
+    spec = chosen_spec(what, scale, changes, out, programs, sampling, worlds=worlds)
     if (folder := _folder(what)) is not None:
         return spec, folder
     if out is None:
@@ -99,17 +98,17 @@ def chosen_spec(
     programs: Sequence[str | None] = (),
     sampling: Sampling | None = None,
     *,
-    many_worlds: bool = False,
+    worlds: str | None = None,
 ) -> Spec:
     """Find the named specification as `chosen` does, but do not return its folder."""
     folder = _folder(what)
     if folder is None:
         spec = load_spec(what)
-        spec = replaced(spec.in_many_worlds() if many_worlds else spec, changes)
+        spec = replaced(spec if worlds is None else spec.in_worlds(worlds), changes)
         spec = spec if scale is None else spec.scaled(scale)
         return spec if sampling is None else spec.sampled(sampling)
     with Ledger(folder) as ledger:
-        if (scale, out, sampling) != (None, None, None) or changes or many_worlds:
+        if changes or (scale, out, sampling, worlds) != (None,) * 4:
             raise ConfigError(
                 "cannot be combined with --scale, --set, --sampling, --worlds or --out, because "
                 "the folder stores them",

@@ -165,15 +165,16 @@ class FixedWorld:
         return len(replans) == self.flights and least <= statistics.median(replans) <= most
 
     def describe(self, worlds: Container[str]) -> str:
-        """Describe the seeds of these worlds, and the rule, in one line."""
+        """Describe the seeds of these worlds, and the rule, in one line; empty without both."""
         phrases = []
-        for world in filter(worlds.__contains__, self.world_seed):
-            seed = self.world_seed[world]
-            flown = self.flown.get(world)
-            median = "named" if flown is None else f"median {statistics.median(flown[-1]):g}"
-            phrases.append(f"{world} {seed} ({median})")
-        return "; ".join(filter(None, [f"world seeds: {', '.join(phrases or ['none yet'])}",
-                                       self.rule()]))  # fmt: skip
+        for world, seed in self.world_seed.items():
+            if world in worlds:
+                flown = self.flown.get(world)
+                median = "named" if flown is None else f"median {statistics.median(flown[-1]):g}"
+                phrases.append(f"{world} {seed} ({median})")
+        if self.replans is None:
+            return f"world seeds: {', '.join(phrases)}" if phrases else ""
+        return f"world seeds: {', '.join(phrases or ['none yet'])}; {self.rule()}"
 
     def rule(self) -> str:
         """Describe the rule in a phrase; empty without a rule."""
@@ -302,14 +303,16 @@ class Spec:
         flown = {kind.config.world for kind in self.kinds()}
         return "" if self.fixed_world is None else self.fixed_world.describe(flown)
 
-    def in_many_worlds(self) -> Spec:
-        """Return the same campaign with a generated world for each seed.
+    def in_worlds(self, worlds: str) -> Spec:
+        """Return the same campaign in its `fixed` worlds, or in `many`, one for each seed.
 
         Raises:
             ConfigError: it has no fixed worlds.
         """
         if self.fixed_world is None:
             raise ConfigError(f"campaign {self.name!r} has no fixed worlds", key="worlds")
+        if worlds == "fixed":
+            return self
         return replace(self, name=f"{self.name}-many-worlds", fixed_world=None)
 
     def missions(self) -> list[PlannedMission]:

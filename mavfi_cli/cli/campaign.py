@@ -32,9 +32,9 @@ _SET = _what("--set", "changes", multiple=True, metavar="KEY=VALUE[,VALUE]",
 _SAMPLING = _what("--sampling", type=click.Choice(["uniform", "stratified"]),
                   help="How faults are drawn: each by itself, or in rounds, with more of them "
                        "where outcomes have varied, and weights  [as specified].")  # fmt: skip
-_WORLDS = _what("--worlds", type=click.Choice(["fixed", "many"]), default="fixed",
+_WORLDS = _what("--worlds", type=click.Choice(["fixed", "many"]),
                 help="Worlds of a campaign that has fixed ones: these, or another one for each "
-                     "seed.")  # fmt: skip
+                     "seed  [fixed].")  # fmt: skip
 _KEEP = ("none", "failures", "sampled", "all")
 # Options of `status` that imply --full.
 _FULL = {"by", "confidence", "quality", "overhead", "failures"}
@@ -100,7 +100,7 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
     trusted = (options["firmware"], options["companion"])
     spec, folder = chosen(
         what, options["out"], options["scale"], options["changes"], programs=trusted,
-        sampling=_sampling(options["sampling"]), many_worlds=options["worlds"] == "many",
+        sampling=_sampling(options["sampling"]), worlds=options["worlds"],
     )  # fmt: skip
     flying = Options(
         **grouped.given_fields(
@@ -331,7 +331,7 @@ def keys(folder: Path) -> None:
 
 
 def _planned(
-    what: str, scale: float | None, changes: Sequence[str], worlds: str
+    what: str, scale: float | None, changes: Sequence[str], worlds: str | None
 ) -> tuple[dict[str, Any], list[str]]:
     """Describe the missions of a campaign: a dict for JSON, and lines of text."""
     from collections import Counter
@@ -339,7 +339,7 @@ def _planned(
     from mavfi_cli.campaigns.begin import chosen_spec, flyable
     from mavfi_cli.campaigns.missions import label_text
 
-    spec = chosen_spec(what, scale, changes, many_worlds=worlds == "many")
+    spec = chosen_spec(what, scale, changes, worlds=worlds)
     missions = flyable(spec)
     settings = Counter(label_text(mission.labels) for mission in missions)
     rule = spec.describe_worlds() or None

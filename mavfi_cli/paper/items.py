@@ -229,9 +229,13 @@ class FlightsPlan:
         wanted = set(items) or set(self.items)
         presets = dict.fromkeys(item.preset for item in ITEMS if item in wanted and item.preset)
         specs = [load_spec(preset).scaled(scale) for preset in presets]
-        if self.worlds == "many":
-            specs = [replace(spec, fixed_world=None) for spec in specs]
-        return [replace(spec, fixed={**spec.fixed, "stack": self.stack}) for spec in specs]
+        return [
+            replace(
+                spec if spec.fixed_world is None else spec.in_worlds(self.worlds),
+                fixed={**spec.fixed, "stack": self.stack},
+            )
+            for spec in specs
+        ]
 
 
 def _numbers_of(ledger: Ledger, keys: Iterable[Key]) -> list[int]:

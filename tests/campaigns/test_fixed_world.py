@@ -178,6 +178,7 @@ def test_seeds_alone_need_no_rule(begun):
     text = SPEC[: SPEC.index("[fixed_world]")] + named + SPEC[SPEC.index("[[setting]]") + 11 :]
     spec = spec_of(text)
     assert spec.describe_worlds() == "world seeds: flat 7 (named)"
+    assert replaced(spec, ["world=rising"]).describe_worlds() == ""
     assert {kind.config.world_seed for kind in spec.kinds()} == {7, None}
 
 
@@ -187,13 +188,14 @@ def test_presets_of_the_paper_fly_its_fixed_worlds(preset):
     seeds = {kind.config.world: kind.config.world_seed for kind in spec.kinds()}
     if preset in {"fig7", "fig8", "fig9", "fig13", "fig14", "fig16", "table3", "table4"}:
         assert seeds.items() <= spec.fixed_world.world_seed.items()
-        many = spec.in_many_worlds()
+        assert spec.in_worlds("fixed") == spec
+        many = spec.in_worlds("many")
         assert {kind.config.world_seed for kind in many.kinds()} == {None}
         assert len(many.missions()) == len(spec.missions())
     else:
         assert {*seeds.values()} == {None}
         with pytest.raises(ConfigError, match=r"worlds: .*has no fixed worlds"):
-            spec.in_many_worlds()
+            spec.in_worlds("many")
 
 
 def test_unknown_fixed_worlds_are_refused():

@@ -14,7 +14,7 @@ from mavfi_cli.studies.compare import ComparePlan
 
 
 def test_as_it_stands_it_is_the_preset_fig16_mission_for_mission():
-    assert ComparePlan().spec().missions() == load_spec("fig16").in_many_worlds().missions()
+    assert ComparePlan().spec().missions() == load_spec("fig16").in_worlds("many").missions()
 
 
 def test_the_missions_of_two_platforms_differ_in_the_platform_only():
@@ -49,7 +49,7 @@ def test_more_missions_come_at_the_end_of_the_list():
 def test_a_stack_is_that_of_every_mission_and_of_the_preset_with_it():
     plan = ComparePlan(stack="hardened")
     assert {mission.config.stack for mission in plan.spec().missions()} == {"hardened"}
-    preset = replaced(load_spec("fig16").in_many_worlds(), ["stack=hardened"])
+    preset = replaced(load_spec("fig16").in_worlds("many"), ["stack=hardened"])
     assert plan.spec().missions() == preset.missions()
     assert plan.described().stack == "hardened"
 
