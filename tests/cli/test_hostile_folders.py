@@ -133,8 +133,10 @@ COMMANDS = [
     "reproduce --settle --hours 0.001 --out HOSTILE",
     "train --flown HOSTILE --out models",
     "train --flown . --out models",
-    "train --kind gad --world farm --flights 2 --quiet --out HOSTILE",
-    "train --from HOSTILE/flight.tlog --kind gad --out HOSTILE",
+    pytest.param(
+        "train --kind gad --world farm --flights 10 --quiet --out HOSTILE", marks=pytest.mark.slow
+    ),
+    "train --kind gad --out HOSTILE --from" + 10 * " HOSTILE/flight.tlog",
     "vpm --overhead HOSTILE",
     "vpm --out HOSTILE",
     pytest.param("vpm --fly --missions 1 --quiet --out HOSTILE", marks=pytest.mark.slow),
