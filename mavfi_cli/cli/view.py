@@ -43,8 +43,8 @@ def view(run: Path, save: Path | None, layout: Path | None, as_json: bool) -> No
         raise click.UsageError("--json needs --save FILE")
     if layout is not None and (save is None or save.suffix.lower() != ".mcap"):
         raise click.UsageError("--layout needs --save FILE.mcap")
-    viewers.require_viewer(save)
     recorded = load_run(run)
+    viewers.require_viewer(save)
     golden = _golden(recorded) if recorded.record.fault else None
     named = {"golden": golden, "faulty": recorded} if golden else {"flight": recorded}
     flights = [

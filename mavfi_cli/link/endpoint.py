@@ -113,6 +113,12 @@ class Endpoint:
         return connection
 
 
+class _UrlError(LinkError):
+    """A URL that is not valid, which is a usage error."""
+
+    exit_code = 2
+
+
 def parse_endpoint(url: str) -> Endpoint:
     """Parse a URL of the form `scheme:rest` or `scheme://rest`.
 
@@ -123,14 +129,14 @@ def parse_endpoint(url: str) -> Endpoint:
     rest = rest.removeprefix("//")
     scheme = _ALIASES.get(word, word)
     if scheme not in _FORMS:
-        raise LinkError(f"{url}: unknown kind of endpoint; known: {', '.join(_FORMS.values())}")
-    malformed = LinkError(f"{url}: not of the form {_FORMS[scheme]}")
+        raise _UrlError(f"{url}: unknown kind of endpoint; known: {', '.join(_FORMS.values())}")
+    malformed = _UrlError(f"{url}: not of the form {_FORMS[scheme]}")
 
     def number(text: str, largest: int) -> int:
         if not re.fullmatch(r"[0-9]{1,10}", text, re.ASCII):
             raise malformed
         if int(text) > largest:
-            raise LinkError(f"{url}: the number must be at most {largest}, got {text}")
+            raise _UrlError(f"{url}: the number must be at most {largest}, got {text}")
         return int(text)
 
     if scheme == "fd":
@@ -148,7 +154,7 @@ def parse_endpoint(url: str) -> Endpoint:
         raise malformed
     port = number(match["port"], 65_535)
     if port == 0 and scheme not in LISTENING:
-        raise LinkError(f"{url}: the port must be at least 1, got 0")
+        raise _UrlError(f"{url}: the port must be at least 1, got 0")
     return Endpoint(url=url, scheme=scheme, host=host or _LOOPBACK, port=port)
 
 

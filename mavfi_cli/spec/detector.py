@@ -24,6 +24,12 @@ COMPANION = "companion:"
 """Prefix of the stack name in a model that was fitted to a user's companion."""
 
 
+class _NoModel(ModelError):
+    """A missing option that names a model, which is a usage error."""
+
+    exit_code = 2
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorConfig:
     """The detector of a mission.
@@ -160,7 +166,7 @@ class DetectorConfig:
             return detector
         fit = "fit one with mavfi train --companion"
         if path is None:
-            raise ModelError(f"{self.name} needs --model, a model fitted to the companion; {fit}")
+            raise _NoModel(f"{self.name} needs --model, a model fitted to the companion; {fit}")
         if not made_for.name.startswith(COMPANION):
             raise ModelError(
                 f"this model was fitted to the stack {made_for.name!r}, not to a companion; {fit}",

@@ -223,6 +223,12 @@ def _place(what: str, place: Sequence[float] | Vector | None) -> Vector | None:
 # Generated worlds ---------------------------------------------------------------------------------
 
 
+class _GeneratorError(WorldError):
+    """The parameters of the generator are invalid, which is a usage error."""
+
+    exit_code = 2
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Pair:
     """The generator's two parameters and the family of the random streams."""
@@ -233,10 +239,10 @@ class _Pair:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.density <= 1.0:
-            raise WorldError(f"density must be between 0 and 1, got {self.density:g}")
+            raise _GeneratorError(f"density must be between 0 and 1, got {self.density:g}")
         if not 0.0 < self.size_m <= _CELL_M:
             limits = f"above 0 and at most {_CELL_M:g} m"
-            raise WorldError(f"size must be {limits}, got {self.size_m:g}")
+            raise _GeneratorError(f"size must be {limits}, got {self.size_m:g}")
 
 
 # Pairs of the paper (section VI-A): two for evaluation, four for training.
@@ -257,7 +263,7 @@ def _pair_of_spec(text: str) -> _Pair | None:
     try:
         density, size = (float(part) for part in text.removeprefix("gen:").split(","))
     except ValueError:
-        raise WorldError(
+        raise _GeneratorError(
             f"world must be gen:density,size, such as gen:0.2,5, got {text!r}"
         ) from None
     return _Pair(density=density, size_m=size)

@@ -112,6 +112,22 @@ def test_wrong_usage_is_one_line_and_exits_with_2(command_line, arguments, said)
     assert err.startswith(f"error: {said}")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("fly", "--world", "gen:nan,3"), "density must be between 0 and 1"),
+        (("fly", "--world", "gen:3"), "--world: world must be gen:density,size"),
+        (("kernels", "--program", "nope"), "nope: the program was not found"),
+        (("sitl", "--link", "foo:bar"), "foo:bar: unknown kind of endpoint"),
+        (("gate",), "gad needs --model"),
+    ],
+)
+def test_a_value_that_no_option_type_checks_is_also_wrong_usage(command_line, arguments, said):
+    code, _, err = command_line(*arguments)
+    assert code == 2
+    assert err.startswith(f"error: {said}")
+
+
 def test_an_unknown_command_gets_the_nearest(command_line):
     code, _, err = command_line("fyl")
     assert code == 2
@@ -157,7 +173,7 @@ def test_a_file_that_is_not_there(refused, option):
 
 
 def test_a_link_that_is_no_url(refused):
-    assert refused("--link", "udpx:1", "--goal", "1,2,3").startswith("udpx:1: unknown kind")
+    assert refused("--link", "udpx:1", "--goal", "1,2,3", code=2).startswith("udpx:1: unknown kind")
 
 
 def test_a_serial_device_without_permission(refused, monkeypatch):
