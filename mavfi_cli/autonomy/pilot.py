@@ -228,7 +228,7 @@ class Pilot:
 
     @np.errstate(over="ignore", invalid="ignore")
     def on_report(self, report: CollisionReport) -> bool:
-        """Handle a report of the collision check. Return True if the pilot reacts to a collision.
+        """Handle a report of the collision check. Return True if its time to collision was read.
 
         A report whose future_collision_seq is lower than the newest one is ignored.
         """
@@ -247,7 +247,7 @@ class Pilot:
         self._next = None
         self.want_plan()
         self._react(report)
-        return True
+        return self.params.uses_time_to_collision
 
     def holds(self, trajectory: object) -> bool:
         """Return True if this trajectory is active or next."""

@@ -122,6 +122,8 @@ def structure(
         return _CONVERTER.structure(data, cls)
     except cattrs.BaseValidationError as group:
         key, error = _first_problem(group, "")
+    except TypeError as wrong:  # `data` is not a mapping
+        key, error = "", wrong
     if isinstance(error, ForbiddenExtraKeysError):
         known = [entry.name for entry in dataclasses.fields(error.cl)]
         key = f"{key}.{min(error.extra_fields)}".lstrip(".")

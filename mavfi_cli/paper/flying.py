@@ -266,7 +266,7 @@ def _with_flights(
 
 def _mean_size(parent: Path, unknown: float) -> float:
     """Return the mean size of up to 20 subfolders of `parent`, bytes; `unknown` if it has none."""
-    folders = [path for path in parent.glob("*") if path.is_dir()][-20:]
+    folders = sorted(path for path in parent.glob("*") if path.is_dir())[-20:]
     files = (path for folder in folders for path in folder.rglob("*") if path.is_file())
     return sum(path.stat().st_size for path in files) / len(folders) if folders else unknown
 

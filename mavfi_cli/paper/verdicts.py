@@ -18,6 +18,7 @@ from mavfi_cli.analysis.kernels import IsolatedKernel
 from mavfi_cli.analysis.pairs import Fate, Flights
 from mavfi_cli.campaigns.progress import duration
 from mavfi_cli.core.config import structure
+from mavfi_cli.core.errors import ConfigError, lack_of
 from mavfi_cli.stats.paired import holm
 from mavfi_cli.stats.sequences import anytime_count, anytime_interval, anytime_p
 from mavfi_cli.stats.shares import Interval, wilson, z_of
@@ -188,7 +189,11 @@ class Settling:
         """
         if stored is None:
             return None
-        return structure(json.loads(stored) if isinstance(stored, str) else stored, cls)
+        try:
+            contents = json.loads(stored) if isinstance(stored, str) else stored
+        except (ValueError, RecursionError) as error:
+            raise ConfigError(f"is not JSON: {lack_of(error)}") from None
+        return structure(contents, cls)
 
     def to_json(self) -> str:
         """Return the text that `of` reads."""

@@ -54,14 +54,18 @@ def interval(
     Args:
         values: (n,) one value per mission; for paired differences, one difference per mission.
         statistic: reduces the last axis of an array.
-        weights: (n,) weights of a stratified sample; None for equal ones. If they differ, the
-            statistic is always the weighted mean.
+        weights: (n,) weights of a stratified sample, for the mean only; None for equal ones.
+
+    Raises:
+        ValueError: the weights differ, and the statistic is not the mean.
     """
     sample = np.asarray(values, dtype=np.float64)
     count = len(sample)
     if weights is not None and len(set(weights.tolist())) > 1:
+        if statistic is not mean:
+            raise ValueError("weights that differ need the mean as the statistic")
         rows = partial(_weighted_mean, sample, weights)
-        return interval_of_rows(count, rows, resamples=resamples, confidence=confidence)
+        return interval_of_rows(count, rows, resamples=resamples, confidence=confidence, seed=seed)
     if count == 0:
         return NO_INTERVAL
     value = low = high = float(statistic(sample))
@@ -108,6 +112,7 @@ def interval_of_rows(
     *,
     resamples: int,
     confidence: float = 0.95,
+    seed: int = 1,
 ) -> Interval:
     """Return a statistic over several columns with its interval, found by resampling whole rows.
 
@@ -119,4 +124,5 @@ def interval_of_rows(
         lambda rows: statistic(rows.astype(np.int64)),
         resamples=resamples,
         confidence=confidence,
+        seed=seed,
     )

@@ -276,6 +276,16 @@ def test_a_report_without_a_collision_changes_nothing(driver):
     assert len(driver.requests) == 1
 
 
+@pytest.mark.parametrize("uses", [True, False])
+def test_the_time_to_collision_counts_as_read_only_if_it_is_used(uses):
+    driver = Driver(uses_time_to_collision=uses)
+    driver.fly()
+    report = CollisionReport(stamp_s=driver.now_s, collision=True, time_to_collision_s=9.0,
+                             future_collision_seq=1)  # fmt: skip
+    assert driver.pilot.on_report(report) is uses
+    assert driver.pilot.mode is (PilotMode.EVADING if uses else PilotMode.STOPPING)
+
+
 # Plans in flight -----------------------------------------------------------------------------
 
 

@@ -88,8 +88,9 @@ def test_a_damaged_record_of_settling_is_refused():
     assert Settling.of(stored.to_json()) == stored
     assert Settling.of(json.loads(stored.to_json())) == stored
     assert Settling.of(None) is None
-    with pytest.raises(ConfigError):
-        Settling.of({"looks": "many"})
+    for damaged in ({"looks": "many"}, "{", "[" * 100_000, "[]"):
+        with pytest.raises(ConfigError):
+            Settling.of(damaged)
 
 
 def test_hours_need_settle(mavfi):

@@ -179,6 +179,14 @@ def test_bootstrap_intervals_are_efrons(statistic, oracle):
     assert found.high == pytest.approx(high, abs=0.06 * (high - low))
 
 
+def test_weights_are_refused_for_another_statistic_than_the_mean():
+    values, weights = np.arange(9.0), np.arange(1.0, 10.0)
+    with pytest.raises(ValueError, match="need the mean"):
+        interval(values, median, resamples=99, weights=weights)
+    found = interval(values, resamples=99, weights=weights)
+    assert found.value == np.average(values, None, weights)
+
+
 def test_bootstrap_intervals_cover_as_often_as_they_say():
     rng = np.random.default_rng(3)
     covered = 0

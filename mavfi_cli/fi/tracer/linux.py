@@ -79,7 +79,7 @@ def require_supported() -> None:
     if not SUPPORTED:
         raise TracingForbidden(
             "instruction-level injection",
-            f"this machine is {platform.machine()}",
+            f"this machine is {platform.machine()} {platform.system()}",
             "use an x86-64 Linux machine, or source-level faults",
         )
 

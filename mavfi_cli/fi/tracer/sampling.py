@@ -30,6 +30,7 @@ _CHUNK = 16384
 _BREAKPOINT = b"\xcc"  # the instruction
 _STAGE_COST = 12  # a further stop costs about as much as 12 counted hits
 _HORIZON = 1 << 20
+_DRAWS = 10_000  # instructions without a suitable operand after which no more are drawn
 _NEAR = 16  # instructions before the target that are tried as places for a detour
 
 
@@ -299,11 +300,12 @@ def draw_fault(
         code_at: returns 16 bytes of code at an address.
 
     Raises:
-        FaultError: no executed instruction in scope has such an operand.
+        FaultError: no instruction in scope was executed, or none of many drawn ones has such an
+            operand.
     """
     if not stratum.executed:
         raise FaultError("no instruction in scope was executed")
-    for _ in range(10_000):
+    for _ in range(_DRAWS):
         position = int(rng.integers(stratum.executed))
         address = stratum.address(position)
         instruction = decode(code_at(address), address)
@@ -321,7 +323,9 @@ def draw_fault(
             instruction_bytes=instruction.raw,
             corruption=corruption,
         )
-    raise FaultError("no executed instruction in scope has an operand that the fault model allows")
+    raise FaultError(
+        f"none of {_DRAWS:,} drawn instructions has an operand that the fault model allows"
+    )
 
 
 def draw_fault_here(
