@@ -1,13 +1,13 @@
-r"""What each arm of a campaign loses of the same faults, as a table and a picture.
+r"""Prints and draws how many missions each arm of a campaign loses to the same faults.
 
     python benchmarks/arms.py docs/results/hardening-part1.parquet \
         --picture docs/pictures/hardening.svg
     python benchmarks/arms.py docs/results/ablation.parquet
 
-Reads exports of `mavfi campaign run hardening` and `ablation`. An arm is a stack with a detector.
-Lost are missions whose fault was read and that do not end in success. All arms flew the same
-faults, so their counts pair. Intervals are Wilson's, 95 %; McNemar's exact test compares each arm
-with `mavbench` alone.
+Reads exports of `mavfi campaign run hardening` and `ablation`. An arm is a stack with a detector. A
+mission counts as lost if its fault was read and it does not end in success. All arms flew the same
+faults, so their counts are paired. Intervals are Wilson's, 95 %; McNemar's exact test compares each
+arm with `mavbench` alone.
 """
 
 from __future__ import annotations
@@ -23,12 +23,16 @@ from mavfi_cli.stats.shares import Share
 
 
 def cell(share: Share) -> str:
-    """Count and total; empty if nothing was flown."""
+    """Return a share's count and total as text, which is empty if nothing was flown."""
     return f"{share.count} of {share.total}" if share.total else ""
 
 
 def lines(found: Sequence[Arm]) -> list[str]:
-    """A row an arm: lost of golden flights, at each site, in all; McNemar's p against none."""
+    """Return the lines of a table with one row per arm.
+
+    A row has the lost missions among golden flights, for each injection site and in total, and the
+    p-value of McNemar's test against `mavbench` alone.
+    """
     sites = list(found[0].by_site)
     titles = ["arm", "golden", *sites, "all", "p"]
     printed = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
@@ -42,7 +46,7 @@ def lines(found: Sequence[Arm]) -> list[str]:
 
 
 def draw(found: Sequence[Arm], path: Path) -> None:
-    """Bars of the share of lost missions, with intervals."""
+    """Draw the share of lost missions in each arm as bars with 95 % intervals, as an SVG file."""
     import matplotlib as mpl
 
     mpl.use("svg")
@@ -71,7 +75,7 @@ def draw(found: Sequence[Arm], path: Path) -> None:
 
 
 def main() -> None:
-    """Read, print, draw."""
+    """Read the exports, print the table, and draw the picture if requested."""
     parser = arguments(__doc__)
     parser.add_argument("--picture", type=Path, help="where to draw, as SVG")
     given = parser.parse_args()

@@ -1,11 +1,12 @@
-"""Golden missions in real time over a bad UDP link to `mavfi sitl`.
+"""Flies golden missions in real time over a bad UDP link to `mavfi sitl`.
 
     python benchmarks/bad_link.py --missions 10
     python benchmarks/bad_link.py --missions 3 --cut 3
 
-A proxy between vehicle and companion loses, delays, duplicates and so reorders datagrams, in both
-directions. With `--cut` it forwards nothing for so many seconds, 10 s after take-off. The proxy's
-random numbers are seeded, but the operating system's timing is not, so runs differ.
+A proxy between vehicle and companion drops, duplicates and delays datagrams, and thereby reorders
+them, in both directions. `--cut S` makes it forward nothing for S seconds, beginning 20 s after the
+first datagram. The proxy's random numbers are seeded, but the operating system's timing is not, so
+runs differ.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ CUT_AT_S = 20.0  # after the first datagram: the vehicle is under way by then
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Conditions:
-    """What the proxy does to each datagram."""
+    """How the proxy disturbs the datagrams."""
 
     loss: float  # probability
     jitter_s: float  # the delay is uniform in 0..jitter
@@ -39,7 +40,7 @@ class Conditions:
 
 
 class Proxy(asyncio.DatagramProtocol):
-    """One side of the proxy: passes what it hears to the other side's peer."""
+    """One side of the proxy, which forwards the datagrams it receives to the other side's peer."""
 
     def __init__(self, conditions: Conditions, rng: random.Random) -> None:
         self.conditions, self.rng = conditions, rng
@@ -50,11 +51,11 @@ class Proxy(asyncio.DatagramProtocol):
         self.counts: collections.Counter[str] = collections.Counter()
 
     def connection_made(self, transport: asyncio.DatagramTransport) -> None:
-        """Keep the socket."""
+        """Keep the transport, so that `send` can use it."""
         self.to_peer = transport
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        """Schedule what arrives, if anything does."""
+        """Schedule the forwarding of a datagram, unless the conditions drop it."""
         assert self.other is not None
         self.peer = addr
         loop = asyncio.get_running_loop()
@@ -73,13 +74,13 @@ class Proxy(asyncio.DatagramProtocol):
             loop.call_later(self.rng.uniform(0.0, self.conditions.jitter_s), self.other.send, data)
 
     def send(self, data: bytes) -> None:
-        """Send to the peer of this side, if it is known."""
+        """Send a datagram to the peer of this side, if the peer's address is known."""
         if self.to_peer is not None and self.peer is not None:
             self.to_peer.sendto(data, self.peer)
 
 
 async def relay(vehicle: Proxy, companion: Proxy, ports: tuple[int, int]) -> None:
-    """Listen to the vehicle on the first port; pass everything to the companion's, and back."""
+    """Forward datagrams between the vehicle on the first port and the companion on the second."""
     loop = asyncio.get_running_loop()
     companion.peer = ("127.0.0.1", ports[1])
     await loop.create_datagram_endpoint(lambda: vehicle, local_addr=("127.0.0.1", ports[0]))
@@ -87,7 +88,7 @@ async def relay(vehicle: Proxy, companion: Proxy, ports: tuple[int, int]) -> Non
 
 
 def free_ports(count: int) -> list[int]:
-    """UDP ports that nobody uses now."""
+    """Return UDP ports of this machine that are not in use now."""
     sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
     for each in sockets:
         each.bind(("127.0.0.1", 0))
@@ -98,7 +99,7 @@ def free_ports(count: int) -> list[int]:
 
 
 def fly(seed: int, conditions: Conditions, world: str, out: str) -> dict[str, object]:
-    """Fly one mission through a proxy of its own; its result."""
+    """Fly one mission through a proxy of its own, and return the mission's result."""
     ports = free_ports(2)
     rng = random.Random(seed)
     vehicle, companion = Proxy(conditions, rng), Proxy(conditions, rng)
@@ -129,7 +130,7 @@ def fly(seed: int, conditions: Conditions, world: str, out: str) -> dict[str, ob
 
 
 def main() -> None:
-    """Fly, and count the outcomes."""
+    """Fly the missions, and count their outcomes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--missions", type=int, default=10)
     parser.add_argument("--world", default="sparse")

@@ -1,4 +1,4 @@
-"""Milliseconds to render a depth frame, and to make all its messages, in the dense world.
+"""Measures the time to render a depth frame, and to encode its messages, in the world `dense`.
 
 Run: python benchmarks/camera_render.py
 """
@@ -30,7 +30,7 @@ SIZES = ((64, 48), (256, 144), (512, 288))
 
 
 def milliseconds(action: Callable[[], object], repeats: int = 200) -> float:
-    """Median time of one call, ms."""
+    """Return the median time of one call, in milliseconds."""
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -40,7 +40,7 @@ def milliseconds(action: Callable[[], object], repeats: int = 200) -> float:
 
 
 def main() -> None:
-    """Print one line a pose and one for the whole frame on the wire."""
+    """Print one line per pose, and one line for rendering and encoding a whole frame."""
     boxes = load_world("dense", seed=1).boxes_enu_m
     print(f"{len(boxes)} boxes" + "".join(f"{f'{c}x{r}':>12}" for c, r in SIZES))
     for name, (position, yaw) in POSES.items():
@@ -58,7 +58,7 @@ def main() -> None:
     level = np.array([1.0, 0.0, 0.0, 0.0])
 
     def frame() -> None:
-        """One image: rendered, packed into messages, encoded."""
+        """Render one image, pack it into messages and encode them."""
         for message in camera.poll(next(stamps) * 0.02, np.array([0.0, 0.0, 5.0]), level):
             codec.encode(message)
 

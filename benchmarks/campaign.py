@@ -1,9 +1,9 @@
-"""How many missions an hour a campaign flies, and how much of the time goes outside missions.
+"""Measures the missions per hour of a campaign, and the share of time spent outside missions.
 
     python benchmarks/campaign.py [--missions 100] [--jobs 2 ...] [--world sparse]
 
-Flies golden missions and missions with a source-level fault, pairs by default, then as many with an
-instruction-level fault; each with every number of jobs.
+Flies golden missions, each with `--faults` missions that have a source-level fault, and then the
+same number of missions with an instruction-level fault. Repeats both for every number of jobs.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ OUTSIDE_LIMIT = 0.05
 
 
 class _Last(Spectator):
-    """Keeps the newest progress."""
+    """A spectator that keeps the newest progress of a campaign."""
 
     progress: Progress
 
     def on_progress(self, progress: Progress) -> None:
-        """The newest replaces the one before."""
+        """Replace the kept progress by the newest."""
         self.progress = progress
 
 
 def source_missions(world: str, count: int, faults: int) -> list[PlannedMission]:
-    """Golden flights, each with so many faulty ones."""
+    """Return golden missions, each followed by `faults` missions with a source-level fault."""
     found = []
     for seed in range(1, count // (1 + faults) + 1):
         golden = MissionConfig(world=world, seed=seed, stack=STACK)
@@ -51,7 +51,10 @@ def source_missions(world: str, count: int, faults: int) -> list[PlannedMission]
 
 
 def instruction_missions(world: str, count: int) -> list[PlannedMission]:
-    """Flights with a fault in each stage of the same missions, as Table IV has them."""
+    """Return missions with an instruction-level fault, in each stage in turn.
+
+    As in the paper's Table IV, the stages get their faults in the same missions.
+    """
     return [
         PlannedMission(
             config=MissionConfig(
@@ -64,7 +67,7 @@ def instruction_missions(world: str, count: int) -> list[PlannedMission]:
 
 
 def row(name: str, missions: Sequence[PlannedMission], jobs: int) -> str:
-    """Fly them, and tell one line of the table."""
+    """Fly the missions with a number of jobs, and return their row of the table."""
     last = _Last()
     with tempfile.TemporaryDirectory() as folder:
         options = Options(jobs=jobs, keep=Keep.NONE)
@@ -79,7 +82,7 @@ def row(name: str, missions: Sequence[PlannedMission], jobs: int) -> str:
 
 
 def main() -> None:
-    """Fly and print."""
+    """Fly all missions, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--missions", type=int, default=100)
     parser.add_argument("--jobs", type=int, nargs="+", default=[1, os.cpu_count() or 1])

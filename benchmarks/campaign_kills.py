@@ -1,9 +1,10 @@
-"""50 random kills of a campaign of real flights: nothing lost, nothing doubled, the same results.
+"""Kills a campaign of real flights 50 times, and checks that no result is lost or different.
 
     python benchmarks/campaign_kills.py [--kills 50] [--missions 60] [--seed 1]
 
-Kills the runner, the server that forks the workers, their guards and the workers themselves, and
-runs the campaign again until it is complete.
+Kills the runner, the server that forks the workers, their guards and the workers themselves at
+random times, and runs the campaign again until it is complete. The results must equal those of an
+undisturbed campaign.
 """
 
 from __future__ import annotations
@@ -46,13 +47,16 @@ stage = "planning"
 
 
 def start(spec: Path, folder: Path) -> subprocess.Popen[bytes]:
-    """Begin the campaign, or go on with it."""
+    """Start the campaign in a folder or resume it, and return the process that runs it."""
     line = [*MAVFI, "campaign", "run", str(spec), "--out", str(folder)]
     return subprocess.Popen([*line, "--quiet"], stdout=subprocess.DEVNULL, env=marked(str(folder)))
 
 
 def differences(expected: list[Result], found: list[Result]) -> Iterator[str]:
-    """Missions that came out otherwise, a line each: what of their records differs."""
+    """Yield one line for each mission whose results differ, with the differing keys of its record.
+
+    `expected` has the results of the undisturbed campaign, and `found` those of the disturbed one.
+    """
     one, other = ({number: rest for number, *rest in each} for each in (expected, found))
     for number in sorted({*one, *other}):
         if number not in one or number not in other:
@@ -73,7 +77,7 @@ def differences(expected: list[Result], found: list[Result]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Fly it twice, once with kills, and compare."""
+    """Run the campaign without and with kills, and compare the results."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--missions", type=int, default=60)

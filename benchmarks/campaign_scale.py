@@ -1,9 +1,9 @@
-"""What the campaign itself costs: dispatch of 10,000 missions, a ledger of 1,000,000 rows.
+"""Measures a campaign's own cost: to dispatch 10,000 missions, and a ledger of 1,000,000 missions.
 
     python benchmarks/campaign_scale.py [--queued 10000] [--rows 1000000]
 
-Dispatch is measured with missions that do nothing: this file is their task. The rows are
-synthetic: a tenth is missing, the rest are flights of 40 settings.
+Dispatch is measured with missions that do nothing, for which this file is the task. The ledger's
+missions are synthetic: a tenth of them is missing, and the others are flights of 40 settings.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ DISPATCH_LIMIT_S, LEDGER_LIMIT_S = 0.005, 10.0
 
 
 def prepare() -> None:
-    """Nothing to load: a part of the task, as the one below."""
+    """Do nothing. A task needs this function, which loads code before workers are forked."""
 
 
 def perform(_changes: Mapping[str, Any], out: Path) -> Path:
-    """A mission that does nothing but leave its record."""
+    """Write the record of a mission that does nothing, and return its run folder."""
     run = out / "nothing-1"
     run.mkdir()
     (run / "result.json").write_text('{"outcome": "success", "reason": "", "nodes": {}}')
@@ -44,17 +44,17 @@ def perform(_changes: Mapping[str, Any], out: Path) -> Path:
 
 
 class _Last(Spectator):
-    """Keeps the newest progress."""
+    """A spectator that keeps the newest progress of a campaign."""
 
     progress: Progress
 
     def on_progress(self, progress: Progress) -> None:
-        """The newest replaces the one before."""
+        """Replace the kept progress by the newest."""
         self.progress = progress
 
 
 def dispatch(count: int, jobs: int) -> str:
-    """Fly missions that do nothing; what one costs outside its own process."""
+    """Run missions that do nothing, and return table rows with the cost of one mission."""
     here = str(Path(__file__).resolve().parent)
     os.environ["PYTHONPATH"] = os.pathsep.join([here, os.environ.get("PYTHONPATH", "")])
     missions = [PlannedMission(config=MissionConfig(seed=seed)) for seed in range(count)]
@@ -76,7 +76,7 @@ def dispatch(count: int, jobs: int) -> str:
 
 
 def planned(rows: int) -> Iterator[PlannedMission]:
-    """Missions of as many settings as Table IV."""
+    """Yield planned missions with 40 combinations of world and setting, as many as in Table IV."""
     base = MissionConfig()
     for number in range(rows):
         labels = {"world": f"w{number % 4}", "setting": f"s{number // 4 % (CELLS // 4)}"}
@@ -84,7 +84,7 @@ def planned(rows: int) -> Iterator[PlannedMission]:
 
 
 def fill(folder: Path, rows: int) -> None:
-    """A ledger of that many missions, nine tenths of them flown."""
+    """Write a ledger of `rows` missions, nine tenths of which are flown."""
     rng = np.random.Generator(np.random.PCG64(1))
     with Ledger(folder, writing=True) as ledger:
         store_plan(ledger, list(planned(0)))
@@ -110,14 +110,14 @@ def fill(folder: Path, rows: int) -> None:
 
 
 def timed(name: str, work: Callable[[], object], limit_s: float = LEDGER_LIMIT_S) -> str:
-    """One line of the table."""
+    """Time a function, and return a row of the table with its time and the required one."""
     begun = time.perf_counter()
     work()
     return f"| {name} | {time.perf_counter() - begun:.2f} s | {limit_s:g} s |"
 
 
 def ledger_rows(rows: int) -> Iterator[str]:
-    """Open, resume and summarise a long ledger."""
+    """Yield table rows with the time to open, resume and summarise a ledger of `rows` missions."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "campaign"
         fill(folder, rows)
@@ -142,7 +142,7 @@ def _summarise(folder: Path) -> None:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure dispatch and ledger, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--queued", type=int, default=10_000)
     parser.add_argument("--rows", type=int, default=1_000_000)

@@ -1,13 +1,13 @@
-"""Recompute the claims from exported missions with pandas and SciPy alone.
+"""Recomputes the report's claims from exported missions, with pandas and SciPy alone.
 
 Each claim about faults is recomputed for all faults, for silent ones and for those that end a node.
 
     python benchmarks/claims_recomputed.py EXPORT.parquet KERNELS.json
 
-Nothing of `mavfi_cli` takes part in the numbers: the rules are those of docs/explanation/claims.md,
+No code of `mavfi_cli` computes these numbers: the rules are those of docs/explanation/claims.md,
 and the paper's numbers are typed in once more. The last step compares n, effect, interval and
 verdict with those of `mavfi report`. Ends of drawn intervals (bootstrap, posterior draws) may
-differ by their noise, 10 % of the interval's width. All others are equal to nine digits.
+differ by their noise, 10 % of the interval's width. All other numbers must be equal to nine digits.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ALL = "perception+planning+control"
 
 
 def wilson(hits, n, z=Z):
-    """Wilson's interval of a rate."""
+    """Return the rate of `hits` among `n`, and the ends of its Wilson interval."""
     p = hits / n
     centre = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
@@ -39,7 +39,10 @@ def wilson(hits, n, z=Z):
 
 
 def rate(frame, column, value=True):
-    """Wilson with the design effect of worlds as strata and seeds as clusters."""
+    """Return the rate of a value in a column, its Wilson interval and n, or None without rows.
+
+    The interval includes the design effect of worlds as strata and seeds as clusters.
+    """
     rows = frame[frame[column].notna()]
     if not len(rows):
         return None
@@ -58,7 +61,10 @@ def rate(frame, column, value=True):
 
 
 def minus(a, b):
-    """Newcombe's hybrid interval."""
+    """Return the difference of two rates, `a` minus `b`, with Newcombe's hybrid interval.
+
+    It is None if one of the rates is None.
+    """
     if a is None or b is None:
         return None
     value = a[0] - b[0]
@@ -68,7 +74,7 @@ def minus(a, b):
 
 
 def cluster_effect(change, seeds):
-    """The design effect of seeds on a mean change; at least 1."""
+    """Return the design effect, at least 1, of seeds as clusters on a mean change."""
     residual = change - change.mean()
     sums = residual.groupby(seeds).sum()
     if (residual**2).sum() == 0 or len(sums) in (1, len(change)):
@@ -77,7 +83,10 @@ def cluster_effect(change, seeds):
 
 
 def bonett_price(first, second, seeds):
-    """Rate of the second minus that of the first, of the same missions."""
+    """Return the rate of `second` minus that of `first` in the same missions.
+
+    The interval is that of Bonett and Price. The result is None without missions.
+    """
     if not len(first):
         return None
     change = second.astype(int) - first.astype(int)
@@ -88,7 +97,10 @@ def bonett_price(first, second, seeds):
 
 
 def net(before, after, seeds, rng):
-    """What is undone less what is caused, over what there was; None of fewer than 5."""
+    """Return the net share of harm undone: harm undone minus harm caused, over the harm before.
+
+    The result is None if fewer than 5 missions were harmed before.
+    """
     if before.sum() < 5:
         return None
     effect = cluster_effect(after.astype(int) - before.astype(int), seeds)
@@ -107,7 +119,7 @@ def net(before, after, seeds, rng):
 
 
 def mean(values, frame):
-    """BCa bootstrap over the means of clusters."""
+    """Return the mean over the means of clusters, its BCa bootstrap interval, and n."""
     known = values.notna()
     means = values[known].groupby([frame.world[known], frame.seed[known]]).mean()
     n = int(known.sum())
@@ -125,7 +137,7 @@ def mean(values, frame):
 
 
 def prepare(path):
-    """The flown missions of the paper, each beside its golden flight and its unprotected one."""
+    """Return the paper's flown missions, with columns of their golden and unprotected flights."""
     rows = pd.read_parquet(path)
     rows = rows[(rows.state == "flown") & (rows["stack"] == "mavbench")].copy()
     rows["pair"] = rows.pair.astype(object)  # else pandas maps it to texts
@@ -159,7 +171,10 @@ def prepare(path):
 
 
 def of_fate(rows, fate):
-    """The flights without a fault, and those whose unprotected fault does this to its node."""
+    """Return the flights without a fault, and those whose fault has a fate without a detector.
+
+    The fate is "all", "dead" (the fault ends its node) or "silent" (it does not).
+    """
     if fate == "all":
         return rows
     ended = rows.dead.where(rows.detector.isna(), rows.bare_dead)
@@ -167,7 +182,7 @@ def of_fate(rows, fate):
 
 
 class Flights:
-    """The selections that the claims count."""
+    """The missions of an export, with the selections of them that the claims count."""
 
     def __init__(self, rows):
         self.rows = rows
@@ -181,17 +196,20 @@ class Flights:
         self.computers = source[(source.fault_field == "any") & source.fault_target.isin(stages)]
 
     def state(self, target, bits=1, field=("any",)):
-        """Faults in each component of a state."""
+        """Return the missions with a fault in all components of a state at once."""
         rows = self.states
         named = rows.fault_target == target
         return rows[named & (rows.fault_bits == bits) & rows.fault_field.isin(field)]
 
     def kernel(self, *names):
-        """Faults in instructions of these kernels."""
+        """Return the unprotected missions in Sparse with an instruction-level fault in a kernel."""
         return self.kernels[self.kernels.struck_kernel.isin(names)]
 
     def protected(self, detector, protect=ALL, level="instruction", platform="x86"):
-        """Flights with a detector whose fault struck without it as well."""
+        """Return the flights with a detector whose fault also struck in the unprotected flight.
+
+        Their golden flights succeed.
+        """
         rows = self.rows
         seen = (rows.detector == detector) & (rows.protect == protect) & (rows.level == level)
         seen &= (rows.platform == platform) & (rows.own_lost == False)  # noqa: E712
@@ -200,26 +218,29 @@ class Flights:
 
 
 def success_lost(rows):
-    """Golden success minus success with the fault."""
+    """Return the success rate of the golden flights minus that of the flights with a fault."""
     rows = rows[rows.own_lost.notna()]
     seeds = rows.world + rows.seed.astype(str)
     return bonett_price(~rows.lost, ~rows.own_lost.astype(bool), seeds)
 
 
 def longer(rows):
-    """Share of successful flights over 10 % longer than golden."""
+    """Return the share of successful flights that take over 10 % longer than the golden ones."""
     return rate(rows[rows.over_own.notna()], "harmed")
 
 
 def change(rows, own, new, ratio=True):
-    """Mean change of a column from the golden flight."""
+    """Return the mean change of a column from the golden flight, as a ratio or a difference."""
     rows = rows[rows.over_own.notna()]
     difference = rows[new] - rows[own]
     return mean(difference / rows[own] if ratio else difference, rows)
 
 
 def undone(rows, column, rng):
-    """Net share of an ill that a detector undoes."""
+    """Return the net share of the harm in a column, such as lost missions, that a detector undoes.
+
+    It is None if fewer than 5 missions are harmed without the detector.
+    """
     rows = rows[rows[column].notna() & rows[f"bare_{column}"].notna()]
     seeds = rows.world + rows.seed.astype(str)
     before, after = (rows[name].astype(bool) for name in (f"bare_{column}", column))
@@ -227,7 +248,7 @@ def undone(rows, column, rng):
 
 
 def back(rows, rng):
-    """Net share of longer flights that a detector brings back."""
+    """Return the net share of longer flights that a detector brings back to normal length."""
     return undone(rows[(rows.bare_lost == False) & ~rows.lost], "harmed", rng)  # noqa: E712
 
 
@@ -235,28 +256,31 @@ def back(rows, rng):
 
 
 def margin(n):
-    """The least effect that n missions can rule out in a family of four."""
+    """Return the least effect that n missions can rule out in a family of four claims."""
     z = stats.norm.ppf(1 - 0.05 / 4 / 2)
     return math.ceil(wilson(0, n, z)[2] / 0.005) * 0.005
 
 
 def more(n):
-    """The range of a direction."""
+    """Return the range of effects that confirms a claim about a direction, for n missions."""
     return margin(n), math.inf
 
 
 def size(value):
-    """The range of a size."""
+    """Return the range of effects that confirms a claim of a size: up to a factor of 3."""
     return value / 3, 3 * value
 
 
 def share(value):
-    """The range of the size of a share."""
+    """Return the same range for a share, without an upper end if it would reach 1."""
     return value / 3, 3 * value if 3 * value < 1 else math.inf
 
 
 def verdicts(family):
-    """Verdicts of [(effect, range)]: Holm over the p-values of the nearest ends."""
+    """Return the verdicts of a family of claims, each given as its effect and its range.
+
+    A claim's p-value is that of the nearest end of its range. Holm's method corrects the p-values.
+    """
     scores = []
     for effect, (low, high) in family:
         if effect is None:
@@ -290,7 +314,7 @@ def verdicts(family):
 
 
 def of_flights(f, kernels, rng):
-    """Effect and range of each claim about flights, by its name."""
+    """Yield the name, effect and range of each claim about flights."""
     planning = f.kernel("rrt", "rrtconnect", "rrtstar", "control")
     perception = f.kernel("point_cloud", "octomap", "collision_check")
     harm = lambda rows: rate(rows, "harmed")  # noqa: E731
@@ -350,7 +374,7 @@ def of_flights(f, kernels, rng):
 
 
 def of_detectors(f, rng):
-    """Effect and range of each claim about what detectors undo and cost."""
+    """Yield the name, effect and range of each claim about what detectors undo and cost."""
     for name in ("gad", "aad"):
         arm = {
             protect: undone(f.protected(name, protect), "harmed", rng)
@@ -382,7 +406,7 @@ def of_detectors(f, rng):
 
 
 def of_computers(f, rng):
-    """Effect and range of each claim about the TX2."""
+    """Yield the name, effect and range of each claim about the TX2."""
     tx2, x86 = (f.computers[f.computers.platform == name] for name in ("tx2", "x86"))
     trend = minus(rate(tx2, "harmed"), rate(x86, "harmed"))
     yield "fig16-trend", trend, (-margin(300), margin(300))
@@ -393,7 +417,10 @@ def of_computers(f, rng):
 
 
 def mover(a, b):
-    """The difference of two effects that are no shares."""
+    """Return the difference of two effects that may lie outside -1 to 1, with its interval.
+
+    It is None if one of the effects is None.
+    """
     if a is None or b is None:
         return None
     value = a[0] - b[0]
@@ -402,7 +429,10 @@ def mover(a, b):
 
 
 def ranking(rows, kernels, rng):
-    """Spearman's correlation of silent corruption alone and harm in flight."""
+    """Return Spearman's correlation, over kernels, of SDC in isolation and harm in flight.
+
+    It is None for fewer than 5 kernels, or if all kernels do equal harm in flight.
+    """
     names = sorted(set(rows.struck_kernel) & set(kernels))
     flown = [(rows[rows.struck_kernel == name].harmed.dropna().astype(bool)) for name in names]
     if len(names) < 5 or len({y.mean() for y in flown}) == 1:
@@ -420,7 +450,7 @@ def ranking(rows, kernels, rng):
 
 
 def of_kernels(kernels):
-    """Effect and range of each claim about isolated kernels, by its name."""
+    """Yield the name, effect and range of each claim about isolated kernels."""
 
     def outcome(name, kind):
         found = kernels[name][kind]
@@ -445,7 +475,7 @@ WITHOUT_FATES = ("fig6", "table4-golden", "table5")
 
 
 def recomputed(export, kernels):
-    """Effect and verdict of each claim, by its name and the fate of the faults."""
+    """Return the effect and verdict of each claim, keyed by its name and the fate of faults."""
     runs = {each["kernel"]: each["outcomes"] for each in json.loads(kernels.read_text())["kernels"]}
     rng = np.random.default_rng(7)
     rows = prepare(export)
@@ -470,7 +500,7 @@ def recomputed(export, kernels):
 
 
 def of_mavfi(export, kernels):
-    """Effect and verdict of each claim as `mavfi report` has them."""
+    """Return the same effects and verdicts as `mavfi report` computes them."""
     from mavfi_cli.analysis.pairs import Fate
     from mavfi_cli.paper.claims import ISOLATED, judged
     from mavfi_cli.paper.sources import Evidence
@@ -494,7 +524,7 @@ DRAWN = ("fig7-ranking", "fig7-mean", "table3-time", "table3-energy", "table3-re
 
 
 def equal(name, mine, theirs):
-    """Whether two effects are equal, drawn ones but for their noise."""
+    """Return True if two effects are equal, or differ by noise in the ends of a drawn interval."""
     if mine is None or theirs is None:
         return mine is theirs
     close = [math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)
@@ -506,14 +536,17 @@ def equal(name, mine, theirs):
 
 
 def as_text(numbers):
-    """An effect with its interval and n."""
+    """Return an effect with its interval and n as text."""
     if numbers is None:
         return "no effect"
     return "{:+.6f} ({:+.6f} to {:+.6f}), n = {:,}".format(*numbers)
 
 
 def main() -> int:
-    """Recompute, compare, print."""
+    """Recompute the claims, compare them with the report's, and print them.
+
+    Return the exit code, which is 1 if a claim differs.
+    """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("export", type=Path, help="the paper's missions, a .parquet file")
     parser.add_argument("kernels", type=Path, help="summary of `mavfi kernels`, a .json file")

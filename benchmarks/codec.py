@@ -1,4 +1,4 @@
-"""Microseconds to encode and to decode the messages of a mission tick, ours beside pymavlink's.
+"""Measures the time to encode and decode the messages of a tick, by our codec and pymavlink's.
 
 Run: python benchmarks/codec.py
 """
@@ -29,7 +29,7 @@ def _microseconds(call: Callable[[], object]) -> float:
 
 
 def main() -> None:
-    """Print one line a message."""
+    """Print one line per message, with the four times in microseconds."""
     print(f"{'us per message':<32}{'encode':>9}{'decode':>9}{'pymavlink':>11}{'pymavlink':>11}")
     for message in _messages():
         ours, theirs = Codec(1, 1), dialect.MAVLink(None, 1, 1)

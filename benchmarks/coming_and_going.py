@@ -1,11 +1,11 @@
-"""Two simulated hours of `mavfi sitl` with clients that come and go: does its memory stay flat?
+"""Checks that the memory of `mavfi sitl` stays flat while clients come and go for two hours.
 
     python benchmarks/coming_and_going.py --hours 2 --speed 20
 
-Up to 8 clients at a time connect over TCP or UDP, ask for parameters, a fast stream or the camera,
-take off or land, and leave after a few seconds, some of them without a word. The command prints
-the memory of the server every ten simulated minutes, and ends with 1 if it grows by more than 5 %
-after the first tenth of the time.
+The hours are simulated. Up to 8 clients at a time connect over TCP or UDP, request parameters, a
+fast stream or the camera, take off or land, and leave after a few seconds. Some of them never read
+what the server sends. The command prints the memory of the server every ten simulated minutes, and
+exits with 1 if it grows by more than 5 % after the first tenth of the time.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _ORDERS = (
 
 
 class _Visitor:
-    """A client that gives a few orders and leaves."""
+    """A client that sends a few requests and leaves."""
 
     def __init__(self, server: Server, rng: random.Random) -> None:
         over_tcp = rng.random() < 0.5
@@ -63,7 +63,7 @@ class _Visitor:
         self.leaves_s = time.monotonic() + rng.uniform(*_STAY_S)
 
     def act(self) -> None:
-        """Give an order now and then, and read what came unless it never reads."""
+        """Send a random request now and then, and read all waiting bytes if this client reads."""
         with contextlib.suppress(OSError):
             if self._rng.random() < 0.2:
                 self._socket.send(self._codec.encode(self._rng.choice(_ORDERS)))
@@ -71,12 +71,12 @@ class _Visitor:
                 pass
 
     def leave(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self._socket.close()
 
 
 def soak(hours: float, speed: float) -> float:
-    """Return the growth of the server's memory after the first tenth of the time, a share."""
+    """Return by what share the server's memory grows after the first tenth of the time."""
     rng = random.Random(1)
     visitors: list[_Visitor] = []
     with running_server("--speed", f"{speed:g}") as server:
@@ -108,7 +108,7 @@ def soak(hours: float, speed: float) -> float:
 
 
 def main() -> None:
-    """Soak, and report."""
+    """Run the clients, report the growth of the memory, and exit with 1 if it is too large."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--hours", type=float, default=2.0)
     parser.add_argument("--speed", type=float, default=20.0)

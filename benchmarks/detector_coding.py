@@ -1,8 +1,8 @@
-"""Ways to join sign and exponent into a code, compared on golden runs.
+"""Compares ways to code a value's sign and exponent as an integer, on golden runs.
 
     python benchmarks/detector_coding.py RUNS
 
-RUNS is a folder below which golden runs of `mavfi fly` lie, of training worlds and of others.
+RUNS is a folder that contains golden runs of `mavfi fly`, in training worlds and in others.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mavfi_cli.detect.preprocess import DETECTED
 
 
 def coded(values: np.ndarray, way: str, floor: int, ceiling: int) -> np.ndarray:
-    """Codes of float64 values under one of the candidate ways."""
+    """Return the integer codes of float64 values under one of the candidate ways of coding."""
     patterns = np.ascontiguousarray(values).view(np.int64)
     negative, exponent = patterns < 0, (patterns >> 52) & 0x7FF
     if way == "12 bits":
@@ -35,7 +35,10 @@ def coded(values: np.ndarray, way: str, floor: int, ceiling: int) -> np.ndarray:
 def changes(
     values: np.ndarray, way: str, floor: int, ceiling: int, *, wraps: bool = False
 ) -> np.ndarray:
-    """Deltas between consecutive samples; a yaw that wraps from beyond +-2 rad has not changed."""
+    """Return the differences between the codes of consecutive samples.
+
+    With `wraps`, a yaw that changes its sign beyond +-2 rad counts as unchanged.
+    """
     deltas = np.diff(coded(values, way, floor, ceiling))
     wrapped = (np.abs(values) >= 2.0) & (np.abs(values) < 4.0)
     opposite = wrapped[1:] & wrapped[:-1] & (values[1:] * values[:-1] < 0.0)
@@ -43,10 +46,13 @@ def changes(
 
 
 def coding(runs: list[Run]) -> None:
-    """Candidates: normal range of the deltas, and the material flips that leave it."""
+    """Print, for each candidate, the normal range of deltas and the flips that exceed it."""
     training, held = apart(runs)
     if not (training and held):
-        raise SystemExit(f"error: {len(training)} runs of training worlds, {len(held)} of others")
+        raise SystemExit(
+            f"error: needs golden runs of both kinds, got {len(training)} in training worlds and "
+            f"{len(held)} in others"
+        )
     rng = np.random.default_rng(1)
     ways = [("12 bits", 0), ("two's complement", 0)]
     ways += [("signed log", floor) for floor in (-10, -4, -3, -2, -1, 0, 1, 2)]
@@ -91,7 +97,10 @@ def flips_beyond(
     values: np.ndarray, name: str, way: str, floor: int, ceiling: int, limit: int,
     rng: np.random.Generator,
 ) -> tuple[int, int]:  # fmt: skip
-    """Material flips whose delta is beyond the limit, and all material ones."""
+    """Return how many material flips have a delta beyond the limit, and how many there are.
+
+    A flip is material if it changes the value enough to matter.
+    """
     if len(values) < 2:
         return 0, 0
     rows = rng.integers(1, len(values), size=20)

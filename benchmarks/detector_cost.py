@@ -1,12 +1,12 @@
-"""What a detector costs: the gate by itself, over and over; and the gate in flights.
+"""Measures what detectors cost: the gate alone in a loop, and the gate in flights.
 
     python benchmarks/detector_cost.py [--flights 7] [--fault-seed 12]
 
-In flights the caches hold other things, so a check costs several times more. Both kinds of flight
-are of `dense`, seed 3, on the stack `hardened`: golden ones, and those with a flip in an exponent
-of a planned waypoint, after which stages compute again. Shares are of the flight time, as in the
-paper's Table V: for detection the host time of all checks, looks through plans included, for
-recovery the simulated latencies of what was computed again.
+In flights the caches hold other data, so a check costs several times more. The flights are in
+`dense`, seed 3, on the stack `hardened`. They are golden, or have a flip in an exponent of a
+planned waypoint, after which stages are recomputed. Shares are of the flight time, as in the
+paper's Table V: for detection the host time of all checks, including those of plans, and for
+recovery the simulated latencies of the recomputed stages.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ WAYPOINT_TICKS = 25
 
 
 def in_loop() -> None:
-    """Time a minute of flight, over and over; the best of several rounds."""
+    """Time the gate in a loop over a minute of flight, and print the best of several rounds."""
     ticks = 3000
     angles = np.arange(ticks) * 0.004
     waypoints = np.zeros((ticks // WAYPOINT_TICKS + 1, 10))
@@ -57,14 +57,17 @@ def in_loop() -> None:
                              future_collision_seq=1)  # fmt: skip
 
     def loop(judge: Callable[[Trajectory, int, Command], object]) -> float:
-        """Nanoseconds a tick of judging the whole flight."""
+        """Return the mean time to judge one tick of the whole flight, in nanoseconds."""
         begun = perf_counter_ns()
         for i, command in enumerate(commands):
             judge(trajectory, i // WAYPOINT_TICKS, command)
         return (perf_counter_ns() - begun) / ticks
 
     def timed(name: str) -> float:
-        """The same for a new gate, after a first one that must stay silent."""
+        """Return the mean time in which a detector's new gate judges a tick, in nanoseconds.
+
+        Another gate of the detector first checks that the flight raises no alarm.
+        """
         first, gate = (Gate(DetectorConfig(name=name).build("hardened")) for _ in range(2))
         assert not any(first.judge_tick(trajectory, i // WAYPOINT_TICKS, c) for i, c in
                        enumerate(commands)), "this flight is error-free"  # fmt: skip
@@ -95,7 +98,7 @@ def in_loop() -> None:
 
 
 def in_flights(flights: int, fault_seed: int) -> None:
-    """Time the gate in whole missions; medians over the flights."""
+    """Time the gate in whole missions, and print medians over the flights."""
     fault = ("--inject", "planning", "--field", "exponent", "--fault-seed", str(fault_seed))
     print(f"\n{'detector':10} {'flight':8} {'checks/s':>9} {'a check, us':>12} {'detection':>10}"
           f" {'recovery':>9} {'alarms':>7}")  # fmt: skip

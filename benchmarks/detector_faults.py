@@ -1,8 +1,8 @@
-"""What a bit flip in the detector itself does: one flip a flight, somewhere in its memory.
+"""Counts what bit flips in the detector itself do: one flip per flight, anywhere in its memory.
 
     python benchmarks/detector_faults.py --flights 50 --out detector-faults
 
-Each flight is paired with the same flight, detector and all, without the flip. All fly the stack
+Each flight is paired with a flight that has the same detector but no flip. All fly the stack
 `hardened`.
 """
 
@@ -27,7 +27,7 @@ FIRST_SEED = 600_000
 
 
 def main() -> None:
-    """Fly and count."""
+    """Fly the missions, and print what the flips did."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--flights", type=int, default=50, help="of each world")
     parser.add_argument("--world", nargs="+", default=["sparse", "dense"])
@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def _what_happened(calm: dict, struck: dict) -> list[str]:
-    """What became of one struck flight beside its unharmed pair."""
+    """Return the categories to count for a flight with a flip, compared with the one without."""
     found = ["flights"]
     if struck["fault"]["state"] != "applied":
         return [*found, "not injected"]

@@ -1,10 +1,11 @@
-"""Bit flips in flown messages: which of them every detector sees, and what an alarm should do.
+"""Flips bits in flown messages, to compare detectors, or the effects of their alarms.
 
     python benchmarks/detector_flips.py found RUNS
     python benchmarks/detector_flips.py reference RUNS
 
-RUNS is a folder below which golden runs of `mavfi fly` lie. `found` asks every detector.
-`reference` asks what an alarmed sample should do to the model and to the next delta.
+RUNS is a folder that contains golden runs of `mavfi fly`. `found` prints which flips each detector
+finds. `reference` prints the alarms of the Gaussian detector if it learns from a sample that raised
+an alarm or not, and if it computes the next delta from that sample or not.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ WAYPOINT_TICKS = 25
 
 
 def flipped(value: float, dtype: DType, bit: int) -> float:
-    """The value with one bit flipped."""
+    """Return a value of a data type with one bit flipped."""
     if dtype is DType.INT32:
         pattern = int(value) & 0xFFFFFFFF ^ 1 << bit
         return float(pattern - (1 << 32) if pattern >> 31 else pattern)
@@ -41,7 +42,7 @@ def flipped(value: float, dtype: DType, bit: int) -> float:
 
 
 def field_of(dtype: DType, bit: int) -> str:
-    """Which field a bit belongs to."""
+    """Return the name of the field to which a bit of a data type belongs."""
     if dtype is DType.INT32:
         return "integer"
     return "sign" if bit == 63 else "exponent" if bit >= 52 else "mantissa"
@@ -60,7 +61,7 @@ class Strike:
 
 
 def strikes(runs: list[Run], count: int) -> Iterator[Strike]:
-    """Pieces of flights, each from the message before the struck one to the one after it."""
+    """Yield `count` pieces of flights, each from before the struck message to the one after it."""
     rng = np.random.default_rng(2)
     while count:
         run = runs[int(rng.integers(len(runs)))]
@@ -91,7 +92,7 @@ def strikes(runs: list[Run], count: int) -> Iterator[Strike]:
 
 
 def found(held: list[Run], count: int = 3000) -> None:
-    """Which strikes raise an alarm at once, and false alarms on the same flights."""
+    """Print the share of strikes that raise an alarm at once, and false alarms, per detector."""
     struck = list(strikes(held, count))
     hours = sum(run.duration_s for run in held) / 3600.0
     kept: dict[str, np.ndarray] = {}
@@ -135,7 +136,10 @@ def found(held: list[Run], count: int = 3000) -> None:
 
 
 def reference(held: list[Run], count: int = 1500) -> None:
-    """An alarmed sample: is it learned from, and is it the next delta's reference?"""
+    """Print the Gaussian detector's alarms for several treatments of samples that raise alarms.
+
+    A treatment learns from such a sample or not, and uses it as the next delta's reference or not.
+    """
     struck = list(strikes(held, count))
     print(f"{'GAD':38} {'strikes found':>14} {'alarms at the next message, each':>33}")
     for label, cold, learns, follows in (
@@ -162,7 +166,7 @@ def reference(held: list[Run], count: int = 1500) -> None:
 
 
 def main() -> None:
-    """Read the runs and answer one of the questions."""
+    """Read the runs, and print the answer to the chosen question."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     questions = {"found": found, "reference": reference}
     parser.add_argument("question", choices=questions)

@@ -1,13 +1,13 @@
-"""A program in an emulator: started natively, copied in front of `main`, and run on in Unicorn.
+"""Runs a program in the Unicorn emulator, from a copy of the native process before `main`.
 
 It exists to check the injector, and shares no code with it. The emulator executes SSE, but not AVX;
 `ENVIRONMENT` makes the C library choose its SSE variants. Both injectors need the same environment,
 so that the addresses of a run are the same.
 
-The emulator would let two kinds of wrong accesses pass, which a processor does not: addresses that
-no process has (it drops their highest bits), and a vector operand that must be aligned and is not.
-The first are refused when a page is first used, the second in the program's own code. The stack may
-grow to its limit, as it may natively.
+The emulator accepts two kinds of invalid accesses that a processor refuses: addresses that no
+process has (it drops their highest bits), and a misaligned vector operand that must be aligned. The
+first kind is refused here when a page is first used, the second in the program's own code. The
+stack may grow to its limit, as it may natively.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ FIXED_ADDRESSES = 0x0040000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mapping:
-    """One mapped part of a process."""
+    """One memory mapping of a process, with its contents."""
 
     start: int
     end: int
@@ -67,14 +67,14 @@ class Mapping:
 
 @dataclass(frozen=True, kw_only=True)
 class Snapshot:
-    """A process in front of the first instruction of `main`.
+    """A copy of a process that stopped before the first instruction of `main`.
 
     Attributes:
         registers: general registers, flags, instruction pointer and base of fs, by name.
         vectors: xmm0 to xmm15.
-        bias: what is added to an address of the file.
+        bias: what is added to an address in the file to get the address in memory.
         heap: end of the heap.
-        aligned: operands that must be aligned, by address of the file.
+        aligned: operands that must be aligned, by the instruction's address in the file.
     """
 
     program: Path
@@ -96,7 +96,7 @@ _ACCESS = re.compile(r"\s*([0-9a-f]+):\s+(\w+)\s.*?(-?0x[0-9a-f]+)?\(%(\w+)(?:,%
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Access:
-    """An operand in memory: `base + index * scale + offset`."""
+    """The address of an operand in memory: `base + index * scale + offset`."""
 
     base: str
     index: str  # empty for none
@@ -105,7 +105,7 @@ class Access:
 
 
 def aligned_accesses(program: Path) -> dict[int, Access]:
-    """The vector operands in memory that must be aligned, by address of the instruction."""
+    """Return the vector operands in memory that must be aligned, keyed by instruction address."""
     listing = subprocess.run(
         ["objdump", "-d", "--no-show-raw-insn", str(program)], capture_output=True, text=True,
         check=True,
@@ -124,7 +124,7 @@ def aligned_accesses(program: Path) -> dict[int, Access]:
 
 
 def take_snapshot(program: Path) -> Snapshot:
-    """Start a program and copy it in front of `main`."""
+    """Start a program, and return a copy of its process before the first instruction of `main`."""
     with program.open("rb") as file:
         elf = ELFFile(file)
         main = elf.get_section_by_name(".symtab").get_symbol_by_name("main")[0]["st_value"]
@@ -161,7 +161,7 @@ def _go_on(pid: int) -> None:
     _ptrace(CONT, pid)
     _, status = os.waitpid(pid, 0)
     if not os.WIFSTOPPED(status) or os.WSTOPSIG(status) != signal.SIGTRAP:
-        raise RuntimeError(f"the program ends before main: status {status:#x}")
+        raise RuntimeError(f"the program ended before it reached main: wait status {status:#x}")
 
 
 def _copy(pid: int, memory: BinaryIO, program: Path, bias: int, main: int) -> Snapshot:
@@ -169,7 +169,7 @@ def _copy(pid: int, memory: BinaryIO, program: Path, bias: int, main: int) -> Sn
     _ptrace(GETREGS, pid, raw)
     words = struct.unpack("27Q", raw.raw)
     if words[16] != bias + main + 1:
-        raise RuntimeError(f"stopped at {words[16]:#x} instead of main")
+        raise RuntimeError(f"the program stopped at {words[16]:#x} instead of at main")
     registers = dict(zip(GENERAL, words, strict=False))
     registers |= {"rip": bias + main, "eflags": words[18], "rsp": words[19], "fs_base": words[21]}
     area = ctypes.create_string_buffer(512)
@@ -236,7 +236,7 @@ def _enter_page(_engine, address, _access, entry, _data):  # type: ignore[no-unt
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class End:
-    """How a run ended: by an exit code, by what a process is killed for, or not at all."""
+    """How a run ended: with an exit code, killed for a reason, or not within its limit."""
 
     exit_code: int | None
     reason: str  # empty if it left by itself
@@ -246,7 +246,7 @@ class End:
 
 
 class Emulation:
-    """One run, from `main` on."""
+    """One emulated run of a program, from the first instruction of `main`."""
 
     def __init__(self, snapshot: Snapshot) -> None:
         self.snapshot = snapshot
@@ -305,11 +305,14 @@ class Emulation:
 
     @property
     def over(self) -> bool:
-        """Whether the program has ended."""
+        """True if the program has ended."""
         return self._exit_code is not None or bool(self._killed)
 
     def count_executions(self, first: int, last: int) -> np.ndarray:
-        """Run to the end; executions (last - first + 1,) of the instruction at each address."""
+        """Run to the end. Return how often the instruction at each address was executed.
+
+        The counts have shape (last - first + 1,).
+        """
         counts = np.zeros(last - first + 2, np.int64)
         counts[0] = first - 1
         self._hook(unicorn.UC_HOOK_CODE, _count_each, counts, first, last)
@@ -317,7 +320,10 @@ class Emulation:
         return counts[1:]
 
     def run_to(self, address: int, k: int) -> bool:
-        """Run until an instruction is about to execute for the k-th time; False if it never is."""
+        """Run until an instruction is about to execute for the k-th time.
+
+        Return False if the program ends before.
+        """
         self._left[0] = k
         handle = self._hook(unicorn.UC_HOOK_CODE, _count_down, self._left, address, address)
         self._go()
@@ -325,18 +331,18 @@ class Emulation:
         if self.over:
             return False
         if self["rip"] != address:
-            raise RuntimeError(f"stopped at {self['rip']:#x} instead of {address:#x}")
+            raise RuntimeError(f"the run stopped at {self['rip']:#x} instead of at {address:#x}")
         return True
 
     def step(self) -> None:
-        """Execute one instruction, a repeated one as often as it repeats."""
+        """Execute one instruction. An instruction with a repeat prefix runs to its end."""
         before = self["rip"]
         self._go(1)
         while self["rip"] == before and not self.over:
             self._go(1)
 
     def finish(self, blocks: int) -> End:
-        """Run to the end, at most that many basic blocks."""
+        """Run to the end, but at most `blocks` basic blocks. Return how the run ended."""
         self._left[0] = blocks
         self._hook(unicorn.UC_HOOK_BLOCK, _count_down, self._left)
         for address, access in self.snapshot.aligned.items():

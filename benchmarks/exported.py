@@ -1,4 +1,4 @@
-"""Shared by the scripts on flown campaigns: exports, counts with intervals, paired tests."""
+"""Helpers for the scripts that read exported campaigns: counts with intervals, paired tests."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ Key = tuple[Any, ...]
 
 
 def arguments(text: str | None) -> argparse.ArgumentParser:
-    """A parser that takes exports of campaigns (`mavfi campaign export`)."""
+    """Return an argument parser that accepts exports of campaigns (`mavfi campaign export`)."""
     parser = argparse.ArgumentParser(description=text)
     parser.add_argument("parts", nargs="+", help="exports of campaigns, as Parquet")
     return parser
 
 
 def flown(parts: list[str]) -> list[Row]:
-    """The flown missions of all parts."""
+    """Return the flown missions of all exports, one row per mission."""
     rows = [row for part in parts for row in pq.read_table(part).to_pylist()]
     return [row for row in rows if row["state"] == "flown"]
 
 
 def key(row: Row, names: tuple[str, ...]) -> Key:
-    """The values of some columns."""
+    """Return the values of the named columns in a row."""
     return tuple(row[name] for name in names)
 
 
 def lost(row: Row) -> bool:
-    """Whether the mission does not end in success."""
+    """Return True if the mission did not end in success."""
     return bool(row["outcome"] != "success")
 
 
 def share(count: int, total: int) -> str:
-    """Count, total and percentage with its Wilson interval, 95 %."""
+    """Return count, total and percentage as text, with the percentage's 95 % Wilson interval."""
     if total == 0:
         return "0 of 0"
     whole = wilson(count, total)
@@ -47,6 +47,9 @@ def share(count: int, total: int) -> str:
 
 
 def against(one: Mapping[Key, bool], other: Mapping[Key, bool]) -> McNemar:
-    """McNemar's exact test of what happened to the faults that both arms flew."""
+    """Return McNemar's exact test of two arms on the faults that both flew.
+
+    Each mapping has the results of one arm, keyed by fault.
+    """
     both = sorted(one.keys() & other.keys(), key=repr)
     return McNemar.of([one[fault] for fault in both], [other[fault] for fault in both])

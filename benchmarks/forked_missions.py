@@ -1,11 +1,12 @@
-"""Missions of all kinds, forked from shared flights and flown whole: equal records, and times.
+"""Compares the records and times of missions forked from shared flights and of whole flights.
 
     python benchmarks/forked_missions.py [--missions 1000] [--jobs 2] [--instruction] [--short]
 
-A repetition is one seed: golden and protected flights, faults in states of every stage with all
-persistences, in the detector, and ends of processes; with `--instruction` faults in instructions
-of every node instead. `--short` flies 10 m. Every file of every run folder is compared, except the
-host section of the result and the measured time of a stop in a fault record.
+The missions of one seed are golden and protected flights, faults in states of every stage with all
+persistences, faults in the detector, and ends of processes. With `--instruction`, the faults are in
+instructions of every node instead. `--short` makes the flights 10 m long. Every file of every run
+folder is compared, except the host section of the result and the measured time of a stop in a fault
+record.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ SHORT: dict[str, Any] = {"world": "farm", "start": (2.0, 2.0, 0.0), "goal": (10.
 
 
 def missions(instruction: bool, short: bool) -> Iterator[PlannedMission]:
-    """Yield missions without an end, seed by seed."""
+    """Yield planned missions without end, seed by seed."""
     for seed in itertools.count(1):
         stack = "mavbench" if seed % 2 else "hardened"
         base = MissionConfig(world=WORLDS[seed % len(WORLDS)], seed=seed, stack=stack)
@@ -69,7 +70,7 @@ def missions(instruction: bool, short: bool) -> Iterator[PlannedMission]:
 
 
 def differing(forked: MissionResult, whole: MissionResult) -> list[str]:
-    """Return the names of the files that differ."""
+    """Return the names of the files that differ between a forked and a whole mission."""
     if forked.path is None or whole.path is None:
         same = (forked.path, forked.reason) == (whole.path, whole.reason)
         return [] if same else ["run folder"]
@@ -80,7 +81,7 @@ def differing(forked: MissionResult, whole: MissionResult) -> list[str]:
 
 
 def contents(path: Path) -> object:
-    """Return a file's contents, without what this machine has measured."""
+    """Return a file's contents, without values measured on this machine, or None without a file."""
     if not path.is_file():
         return None
     if path.suffix != ".json":
@@ -91,7 +92,7 @@ def contents(path: Path) -> object:
 
 
 def main() -> None:
-    """Fly the missions both ways, and compare."""
+    """Fly the missions both ways, compare their files, and exit with 1 if any differ."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--missions", type=int, default=1000)
     parser.add_argument("--jobs", type=int, default=2)

@@ -1,10 +1,10 @@
-"""Time that `mavfi gate` adds to a setpoint, over UDP on this machine.
+"""Measures the time that `mavfi gate` adds to a setpoint, over UDP on this machine.
 
     python benchmarks/gate_latency.py --model gate/gad.json --setpoints 5000
 
-The companion's socket sends setpoints 5 ms apart, and the autopilot's socket sends a state before
-each. It also times the same datagram sent directly between the two sockets, and prints both and
-their difference.
+A socket of a companion sends setpoints 5 ms apart, and a socket of an autopilot sends a state
+before each setpoint. The same datagram is also timed when sent directly between the two sockets.
+Both times and their difference are printed.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def _compute(detector: str, model: str, count: int) -> None:
 
 
 def main() -> None:
-    """Measure, and print medians and 99th percentiles."""
+    """Measure the times, and print their medians and 99th percentiles."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--model", required=True)
     parser.add_argument("--detector", default="gad")

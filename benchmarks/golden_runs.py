@@ -1,4 +1,4 @@
-"""Golden runs on the disk, and when a message carried which state, for the detector benchmarks."""
+"""Reads golden runs for the detector benchmarks, and finds the rows in which messages arrived."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MATERIAL = {"m": 1.0, "m/s": 1.0, "rad": 0.5, "s": 1.0}  # change of a value tha
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One golden run."""
+    """One golden run, with the columns of its trace."""
 
     world: str
     seed: int
@@ -26,18 +26,18 @@ class Run:
 
     @property
     def training(self) -> bool:
-        """Whether its world is one to train on."""
+        """True if the run's world is one for training detectors."""
         return self.world.startswith("train-")
 
     @property
     def duration_s(self) -> float:
-        """Simulated seconds."""
+        """Duration of the run in simulated seconds."""
         stamps = np.asarray(self.columns["stamp_s"], np.float64)
         return float(stamps[-1] - stamps[0])
 
 
 def golden_runs(folder: Path) -> list[Run]:
-    """All runs without a fault below a folder, each world and seed once."""
+    """Return the runs without a fault in a folder and its subfolders, one per world and seed."""
     import pyarrow.parquet as pq
 
     found: dict[tuple[str, int], Run] = {}
@@ -49,23 +49,23 @@ def golden_runs(folder: Path) -> list[Run]:
         world, seed = result["config"]["world"], result["config"]["seed"]
         found[world, seed] = Run(world, seed, columns_of(pq.read_table(trace)))
     if not found:
-        raise SystemExit(f"error: no golden runs below {folder}")
+        raise SystemExit(f"error: found no golden runs with a trace in {folder}")
     return [found[key] for key in sorted(found)]
 
 
 def apart(runs: list[Run]) -> tuple[list[Run], list[Run]]:
-    """The runs of the training worlds, and the others."""
+    """Return the runs in training worlds, and the runs in other worlds."""
     return [run for run in runs if run.training], [run for run in runs if not run.training]
 
 
 def samples_of(run: Run, name: str) -> np.ndarray:
-    """Values of a state, one a message."""
+    """Return the values of a state, one per message that carried it."""
     values = np.ma.filled(run.columns[name].astype(np.float64), np.nan)
     return np.asarray(values)[fresh_rows(run, name)]
 
 
 def fresh_rows(run: Run, name: str) -> list[int]:
-    """Rows in which a new message carried the state."""
+    """Return the trace rows in which a new message carried a state."""
     state = BY_NAME[name]
     mates = NAMES[slice(*SPANS[state.stage])]
     values = np.column_stack(

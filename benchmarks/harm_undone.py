@@ -1,11 +1,12 @@
-r"""What detectors and protections save of the harm that faults do.
+r"""Counts how much of the harm that faults do is undone by detectors and other protections.
 
     python benchmarks/harm_undone.py docs/results/effects-part*.parquet \
         docs/results/protected*.parquet --arms label_detector
 
 Reads exports of campaigns (`mavfi campaign export`). A fault is harmful if its unprotected flight
 (no detector, the first stack) does not end in success, or takes more than 10 % longer than its own
-golden flight. An arm is a value of the columns `--arms`: it flew the same fault in the same world.
+golden flight. An arm is a combination of values of the columns `--arms`, such as one detector. All
+arms flew the same faults in the same worlds.
 'Recovered' counts lost missions that the arm saves. 'Undone' counts harmful faults whose flight
 with the arm succeeds and takes at most 10 % longer than the golden flight. 'Broken' counts harmless
 faults that do harm with the arm. Intervals are Wilson's, 95 %; two arms are compared on the faults
@@ -26,12 +27,12 @@ FAULT = ("fault_target", "fault_field", "fault_seed")
 
 
 def arm_of(row: Row, columns: list[str]) -> str:
-    """How the row was protected; empty if it was not."""
+    """Return the name of the arm that flew a row, which is empty if its columns are empty."""
     return " ".join(str(row[column]) for column in columns if row.get(column))
 
 
 class Faults:
-    """Every fault with its flights.
+    """All faults with their flights in every arm, and which of them do harm.
 
     Args:
         rows: flown missions.
@@ -59,16 +60,16 @@ class Faults:
         }
 
     def excess(self, row: Row) -> float:
-        """Flight time over that of the golden flight, minus 1."""
+        """Return the flight time divided by that of the golden flight, minus 1."""
         return float(row["flight_time_s"]) / self.golden_s[key(row, MISSION)] - 1.0
 
     def harms(self, row: Row) -> bool:
-        """Whether the mission is lost, or longer by more than 10 %."""
+        """Return True if a mission is lost, or takes over 10 % longer than its golden flight."""
         return lost(row) or self.excess(row) > LONGER - 1.0
 
 
 def report(faults: Faults, unprotected: str) -> list[str]:
-    """The table of arms, and McNemar's test of every two of them."""
+    """Return the lines of the table of arms, and of McNemar's test for each pair of arms."""
     arms = sorted({arm for flights in faults.active.values() for arm in flights} - {unprotected})
     lines = [
         f"{len(faults.active)} active faults, {len(faults.harmful)} harmful",
@@ -100,7 +101,7 @@ def report(faults: Faults, unprotected: str) -> list[str]:
 
 
 def main() -> None:
-    """Read, pair, print."""
+    """Read the exports, pair their flights and print the report."""
     parser = arguments(__doc__)
     parser.add_argument("--arms", nargs="+", required=True, help="columns that name an arm")
     parser.add_argument("--unprotected", default="", help="name of the arm without protection")

@@ -1,22 +1,22 @@
-"""Hostile frames at a flying companion: from other systems, and with the autopilot's own ids.
+"""Sends hostile frames to a flying companion, from other systems and with the autopilot's ids.
 
     python benchmarks/hostile_flight.py --frames 1000000 --rate 8000
     python benchmarks/hostile_flight.py --frames 0 --own 4
 
-Each flight is `mavfi fly --link` with a `mavfi sitl` behind a router, which passes all on.
-Once the vehicle is in OFFBOARD, the router adds hostile frames. So they come from the autopilot's
-own address, and nothing is signed. They have right checksums and are of every message that the
-companion handles, with NaN, infinities, extremes and zeros.
+Each flight is `mavfi fly --link` with a `mavfi sitl` behind a router, which forwards everything.
+Once the vehicle is in OFFBOARD, the router adds hostile frames. They thus come from the autopilot's
+own address, and nothing is signed. They have correct checksums and are of every message that the
+companion handles, with NaN, infinities, extreme values and zeros.
 
-`--frames` is the least number of frames of other systems and components. These flights have to
+`--frames` is the least number of frames of other systems and components. These flights must
 succeed. `--own` is the number of flights of each kind with the ids of the autopilot and its camera:
 first with every message, then without those by which an autopilot ends or steers a flight. Up to
-half of these frames are the vehicle's newest messages with some fields changed, a little or at
-will, so that stamps and places are plausible. These flights may have any outcome but `crash` and
-`hang`.
+half of these frames are the vehicle's newest messages with some fields changed, slightly or to any
+value, so that stamps and places are plausible. These flights may have any outcome except `crash`
+and `hang`.
 
-Frames count if the companion has decoded them, which its tlog shows. The command ends with 1 after
-any other outcome, a traceback, a flight of more than 10 minutes, or another exit code.
+A frame counts if the companion has decoded it, as its tlog shows. The command exits with 1 after
+any other outcome, a traceback, a flight of more than 10 minutes, or another exit code of a flight.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def _scalar(rng: random.Random, kind: str) -> float | int:
 
 
 def _near(rng: random.Random, value: float, kind: str) -> float | int:
-    """Return a value near a true one, such as the stamp of the next message."""
+    """Return a random value near a true value, such as the stamp of the next message."""
     if kind in ("float", "double"):
         return value + rng.gauss(0.0, 2.0)
     bits = int("".join(filter(str.isdigit, kind))) - (not kind.startswith("u"))
@@ -82,7 +82,7 @@ def _near(rng: random.Random, value: float, kind: str) -> float | int:
 
 
 def hostile_frame(rng: random.Random, cls: Any, sender: _Sender, true: Any = None) -> bytes:
-    """Return a frame with any contents, or with those of a true message but for some fields."""
+    """Return a frame with random contents, or with those of a true message except some fields."""
     lengths = dict(zip(cls.ordered_fieldnames, cls.array_lengths, strict=True))
     values: list[Any] = []
     for name, kind in zip(cls.fieldnames, cls.fieldtypes, strict=True):
@@ -125,7 +125,7 @@ class Router:
         self.sent: set[bytes] = set()
 
     def turn(self) -> None:
-        """Pass on what waits, and send the hostile frames that are due."""
+        """Forward the waiting datagrams, and send the hostile frames that are due."""
         for ready in select.select([self.vehicle, self.companion], [], [], 0.002)[0]:
             try:
                 data, peer = ready.recvfrom(1 << 16)
@@ -164,7 +164,7 @@ class Router:
 
 
 def heard(tlog: Path, hostile: set[bytes]) -> int:
-    """Return how many hostile frames the companion has decoded."""
+    """Return how many hostile frames the companion has decoded, according to its tlog."""
     data, start, count = tlog.read_bytes(), 0, 0
     while (length := frame_length(data, start + 8, len(data))) > 0:
         count += data[start + 8 : start + 8 + length] in hostile
@@ -188,7 +188,7 @@ def frame_maker(kind: str, rng: random.Random) -> Callable[[dict[_Sender, Any]],
 
 
 def fly(kind: str, seed: int, rate_hz: float) -> tuple[str, str, int]:
-    """Fly once among hostile frames. Return outcome, reason and the number of frames heard."""
+    """Fly once among hostile frames. Return outcome, reason and the number of decoded frames."""
     port = free_port(socket.SOCK_DGRAM)
     router = Router(port, frame_maker(kind, random.Random(seed)), rate_hz)
     link = f"onboard=udpout:127.0.0.1:{router.vehicle.getsockname()[1]}"
@@ -224,7 +224,7 @@ def fly(kind: str, seed: int, rate_hz: float) -> tuple[str, str, int]:
 
 
 def main() -> None:
-    """Fly until enough frames were heard, and report."""
+    """Fly until the companion has decoded enough hostile frames, and report the outcomes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=10_000)
     parser.add_argument("--own", type=int, default=0, help="flights with the autopilot's own ids")

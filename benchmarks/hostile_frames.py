@@ -1,15 +1,15 @@
-"""A flood of random, mutated and valid-looking frames against `mavfi sitl`, over UDP and TCP.
+"""Floods `mavfi sitl` with random, mutated and valid-looking frames, over UDP and TCP.
 
     python benchmarks/hostile_frames.py --frames 10000000
     python benchmarks/hostile_frames.py --frames 10000000 --signed
 
-A third of the frames are random bytes, a third valid frames with flipped bits, and a third frames
-with a right checksum, of any message with any contents. They come from 8 UDP ports and 2 TCP
-connections, as fast as the server reads the TCP connections. An observer with a link of its own
-measures the clock. With `--signed` the server takes signed frames only, the observer signs, and
-nothing about the vehicle may change. The frames are seeded, but not the order of their arrival.
-The command ends with 1 if the server ends, its memory grows by more than 5 %, its clock is slower
-than half, or a signed server obeys.
+A third of the frames are random bytes, a third are valid frames with flipped bits, and a third are
+frames with a correct checksum, of any message with any contents. They come from 8 UDP ports and 2
+TCP connections, as fast as the server reads the TCP connections. An observer with a link of its own
+measures the server's clock. With `--signed`, the server accepts only signed frames, the observer
+signs, and nothing about the vehicle may change. The frames are seeded, but the order of their
+arrival is not. The command exits with 1 if the server ends, its memory grows by more than 5 %, its
+clock runs at less than half of real time, or a signed server obeys an unsigned frame.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _COMMANDS = (16, 20, 21, 22, 176, 179, 185, 192, 246, 400, 410, 511, 512, 520, 2
 
 
 def hostile_frame(rng: random.Random) -> bytes:
-    """Return random bytes, a mutated frame, or a valid frame with any contents."""
+    """Return random bytes, a mutated frame, or a valid frame with random contents."""
     kind = rng.randrange(3)
     if kind == 0:
         return rng.choice((b"", b"\xfd", b"\xfe")) + rng.randbytes(rng.randrange(1, 60))
@@ -58,7 +58,7 @@ def hostile_frame(rng: random.Random) -> bytes:
 
 
 def valid_frame(rng: random.Random) -> bytes:
-    """Return a frame of any message, with any contents and a right checksum."""
+    """Return a frame of a random message, with random contents and a correct checksum."""
     names = [cls.msgname for cls in dialect.mavlink_map.values()]
     name = rng.choice(_LIKELY) if rng.random() < 0.5 else rng.choice(names)
     cls = next(cls for cls in dialect.mavlink_map.values() if cls.msgname == name)
@@ -88,7 +88,7 @@ def _scalar(rng: random.Random, kind: str) -> float | int:
 
 
 def datagrams(seed: int, frames: int) -> list[tuple[bytes, int]]:
-    """Return pieces of hostile bytes that fit a packet, and the number of frames in each."""
+    """Return hostile frames in pieces that fit a packet, and the number of frames in each piece."""
     rng = random.Random(seed)
     pieces, piece, count = [], b"", 0
     for _ in range(frames):
@@ -101,7 +101,7 @@ def datagrams(seed: int, frames: int) -> list[tuple[bytes, int]]:
 
 
 class Observer:
-    """A client that asks, and that measures the server's clock by its LOCAL_POSITION_NED."""
+    """A client that requests messages, and measures the server's clock by LOCAL_POSITION_NED."""
 
     def __init__(self, port: int, *, signed: bool) -> None:
         signing = Signing(key_from_passphrase(_KEY), clock=time.time) if signed else None
@@ -115,13 +115,13 @@ class Observer:
         self.was_armed = False
 
     def send(self, message: Any) -> None:
-        """Send a message."""
+        """Send a message to the server, however long the server takes to accept it."""
         self._socket.settimeout(None)
         self._socket.sendall(self._codec.encode(message))
         self._socket.settimeout(0.0)
 
     def listen(self) -> None:
-        """Take everything that waits, and send a heartbeat each second."""
+        """Handle all waiting messages, and send a heartbeat every second."""
         if time.monotonic() > self._beat_s + 1.0:
             self._beat_s = time.monotonic()
             self.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3))
@@ -143,12 +143,15 @@ class Observer:
             self._boot_ms = message.time_boot_ms
 
     def ask(self, name: str, request: Any, limit_s: float = 60.0) -> Any:
-        """Send a request until a message of a name arrives, and return it."""
+        """Send a request until a message with the given name arrives, and return that message.
+
+        Raises TimeoutError if none arrives within `limit_s`.
+        """
         self.newest.pop(name, None)
         asked_s, until_s = 0.0, time.monotonic() + limit_s
         while name not in self.newest:
             if time.monotonic() > until_s:
-                raise TimeoutError(f"no {name}")
+                raise TimeoutError(f"the server did not send the requested {name}")
             if time.monotonic() > asked_s + 2.0:
                 asked_s = time.monotonic()
                 self.send(request)
@@ -166,7 +169,7 @@ class Observer:
         return bits, home.latitude, home.longitude, home.altitude, beat.custom_mode
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self._socket.close()
 
 
@@ -177,7 +180,7 @@ def message_request(number: int) -> Any:
 
 
 def free_port(kind: socket.SocketKind) -> int:
-    """Return a port that nobody uses now."""
+    """Return a TCP or UDP port of this machine that is not in use now."""
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -193,7 +196,7 @@ class Server:
     output: Path
 
     def said(self) -> str:
-        """Return what the server has printed."""
+        """Return everything that the server has printed so far."""
         return self.output.read_text()
 
     def lost_datagrams(self) -> int:
@@ -203,7 +206,7 @@ class Server:
         return sum(int(row.split()[-1]) for row in rows if row.split()[1].endswith(wanted))
 
     def resident_mb(self) -> float:
-        """Return the memory that the process holds."""
+        """Return the resident memory of the server's process, in MB."""
         status = Path(f"/proc/{self.process.pid}/status").read_text()
         line = next(line for line in status.splitlines() if line.startswith("VmRSS"))
         return int(line.split()[1]) / 1024
@@ -211,7 +214,10 @@ class Server:
 
 @contextlib.contextmanager
 def running_server(*options: str, signed: bool = False) -> Iterator[Server]:
-    """Start a server with one TCP and one UDP port, and end it."""
+    """Run a server with one TCP and one UDP port while the context is active.
+
+    Raises RuntimeError if the server ends by itself.
+    """
     tcp, udp = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_DGRAM)
     with tempfile.TemporaryDirectory() as folder:
         line = [sys.executable, "-m", "sitl", "--world", "farm", *options,
@@ -237,7 +243,7 @@ def running_server(*options: str, signed: bool = False) -> Iterator[Server]:
 
 
 class _Flood:
-    """The senders: UDP sockets and TCP connections that send pieces by turns."""
+    """The UDP sockets and TCP connections that flood the server, each in turn."""
 
     def __init__(self, server: Server) -> None:
         self._udp = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(_UDP_PORTS)]
@@ -253,7 +259,7 @@ class _Flood:
         self._turn = 0
 
     def send(self, piece: bytes) -> bool:
-        """Send a piece over TCP and over UDP; False if no TCP connection takes it now."""
+        """Send a piece over TCP and over UDP. Return False if no TCP connection accepts it now."""
         for number, connection in enumerate(self._tcp):
             with contextlib.suppress(BlockingIOError):
                 while connection.recv(1 << 16):  # what the server says to it
@@ -271,14 +277,14 @@ class _Flood:
         return False
 
     def close(self) -> None:
-        """Hang up."""
+        """Close all sockets."""
         for each in (*self._udp, *self._tcp):
             each.close()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Report:
-    """What a flood did to the server."""
+    """The effects of a flood on the server."""
 
     frames: int
     lost_datagrams: int  # of those sent over UDP
@@ -288,7 +294,7 @@ class Report:
     changed: bool  # armed, mode, parameters or home
 
     def problems(self, *, signed: bool) -> list[str]:
-        """Return what should not be."""
+        """Return a line for every effect that a server must not show."""
         found = []
         if self.growth > 0.05:
             found.append(f"memory grew by {self.growth:.1%}")
@@ -300,7 +306,7 @@ class Report:
 
 
 def flood(frames: int, *, signed: bool, seed: int = 1) -> Report:
-    """Flood a server with frames, half over TCP and half over UDP."""
+    """Flood a server with frames, half over TCP and half over UDP. Return the effects."""
     pieces = datagrams(seed, min(_POOL, frames))
     rng = random.Random(seed)
     with running_server(signed=signed) as server:
@@ -332,7 +338,7 @@ def flood(frames: int, *, signed: bool, seed: int = 1) -> Report:
 
 
 def main() -> None:
-    """Flood, and report."""
+    """Flood a server, report the effects, and exit with 1 if there are problems."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=1_000_000)
     parser.add_argument("--signed", action="store_true")

@@ -1,13 +1,13 @@
-"""Valid frames to `mavfi sitl` from many UDP ports, and its reply to a single one.
+"""Floods `mavfi sitl` with valid frames from many UDP ports, and counts its reply to one frame.
 
     python benchmarks/hostile_ports.py
 
-First 70 ports send frames with a right checksum at a rate, and an observer with a TCP link measures
-the clock of the server. In one flood the frames are of any message, in the other they request
-streams of 250 Hz. Then one HEARTBEAT comes from a port that stays silent, as if its address were
-false, and the bytes that the server sends there are counted. The command ends with 1 if the clock
-is slower than half, or if more than 32 kB answer the HEARTBEAT. The clock depends on the load of
-the machine, which is printed.
+First 70 ports send frames with a correct checksum at a given rate, and an observer with a TCP link
+measures the clock of the server. In one flood the frames are of any message, in the other they
+request streams of 250 Hz. Then one HEARTBEAT comes from a port that stays silent, as if its address
+were forged, and the bytes that the server sends there are counted. The command exits with 1 if the
+clock runs at less than half of real time, or if the server answers the HEARTBEAT with more than
+32 kB. The clock depends on the load of the machine, which is printed.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _udp(port: int) -> socket.socket:
 def clock_under_flood(
     kind: str, ports: int, rate_hz: float, duration_s: float
 ) -> tuple[float, float]:
-    """Return simulated seconds a second under a flood, and the frames that were sent a second."""
+    """Return the simulated seconds per second under a flood, and the frames sent per second."""
     rng = random.Random(1)
     frame = valid_frame if kind == "any message" else _stream_request
     pool = [frame(rng) for _ in range(_POOL)]
@@ -69,7 +69,7 @@ def clock_under_flood(
 
 
 def reply_to_one_heartbeat(duration_s: float) -> tuple[int, int]:
-    """Return the length of a HEARTBEAT, and of all that the server sends after it, bytes."""
+    """Return the length of a HEARTBEAT, and of everything the server sends after it, in bytes."""
     frame = Codec(245, 190).encode(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3))
     with running_server() as server, _udp(server.udp) as client:
         client.send(frame)
@@ -82,7 +82,7 @@ def reply_to_one_heartbeat(duration_s: float) -> tuple[int, int]:
 
 
 def main() -> None:
-    """Measure both, and report."""
+    """Measure the floods and the reply, and report. Exit with 1 if a limit is exceeded."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ports", type=int, default=70)
     parser.add_argument("--rate", type=float, default=5400.0, help="frames a second")

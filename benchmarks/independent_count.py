@@ -1,4 +1,4 @@
-"""PINFI's rule in mavfi and in an emulator: shares of outcomes, and the same faults in both.
+"""Compares PINFI's rule in mavfi and in an emulator: outcome shares, and the same faults in both.
 
     python benchmarks/independent_count.py --out FOLDER [--runs 5000]
         [--emulated 2000] [--pairs 500] [--jobs 2] [--program NAME ...] [--sources FOLDER]
@@ -12,9 +12,9 @@ For each program of tests/programs, or of another folder of C files:
 3. The emulator repeats mavfi's recorded faults: same instruction, same execution, same bits. The
    value of the register before and after the flip, the outcome and the output must be the same.
 
-A table shows the shares of both with the difference and its 95 % interval (Newcombe's method 10),
-and another one what the pairs have in common. `FOLDER/counts.csv` holds all counts, and
-`FOLDER/NAME-*.jsonl` the single faults. The same command resumes an interrupted one.
+One table shows the shares of both with the difference and its 95 % interval (Newcombe's method 10),
+and another shows how many pairs agree. `FOLDER/counts.csv` holds all counts, and
+`FOLDER/NAME-*.jsonl` the individual faults. The same command resumes an interrupted run.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ TESTED = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Struck:
-    """What a fault flips.
+    """The operand that a fault corrupts, and the bits or the jump condition that it flips.
 
     Attributes:
         operand: a register as the assembler names it, `flags`, or `memory`.
@@ -74,7 +74,7 @@ class Struck:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fault:
-    """A fault at the k-th execution of the instruction at an address of the file."""
+    """A fault at the k-th execution of an instruction, which `address` locates in the file."""
 
     address: int
     k: int
@@ -85,7 +85,10 @@ class Fault:
 
 
 def width_of(register: str) -> tuple[int, int]:
-    """First bit and number of bits of a register's part within the full register."""
+    """Return the first bit and the number of bits that a register's name denotes.
+
+    The bits are counted within the full register.
+    """
     if register.startswith(("xmm", "ymm")):
         return 0, 64
     if re.fullmatch(r"[abcd]h", register):
@@ -98,19 +101,19 @@ def width_of(register: str) -> tuple[int, int]:
 
 
 def full_register(register: str) -> str:
-    """The full register of a part of it."""
+    """Return the name of the full register of which a register is a part."""
     if numbered := re.fullmatch(r"(r\d+)[dwb]?", register):
         return numbered[1]
     if vector := re.fullmatch(r"[xyz](mm\d+)", register):
         return f"x{vector[1]}"
     letters = re.fullmatch(r"[re]?([a-d])[xhl]|[re]?(si|di|bp|sp)l?", register)
     if letters is None:
-        raise ValueError(f"unknown register {register}")
+        raise ValueError(f"cannot find the full register of the unknown register {register}")
     return f"r{letters[1]}x" if letters[1] else f"r{letters[2]}"
 
 
 class Code:
-    """The instructions of a program's own text that PINFI attacks."""
+    """The instructions of a program's own functions, and the rule by which PINFI attacks them."""
 
     def __init__(self, program: Path) -> None:
         self._decoder = capstone.Cs(capstone.CS_ARCH_X86, capstone.CS_MODE_64)
@@ -136,11 +139,11 @@ class Code:
             self.instructions[each.address] = each
 
     def targets(self) -> list[int]:
-        """Addresses of the instructions that count."""
+        """Return the addresses of the instructions that PINFI attacks."""
         return [address for address in self.instructions if self.written(address)]
 
     def written(self, address: int) -> list[str]:
-        """Registers that an instruction writes; none if it does not count."""
+        """Return the registers that an instruction writes; none if PINFI does not attack it."""
         found = self.instructions[address]
         groups = (cx86.X86_GRP_JUMP, cx86.X86_GRP_CALL, cx86.X86_GRP_RET)
         if any(found.group(group) for group in groups) or found.mnemonic.startswith("nop"):
@@ -149,7 +152,7 @@ class Code:
         return [found.reg_name(number) for number in numbers]
 
     def draw(self, address: int, rng: np.random.Generator) -> Struck:
-        """Draw what is struck at an instruction."""
+        """Draw the operand and the bit that a fault flips at an instruction."""
         registers = [name for name in self.written(address) if name != "rflags"]
         if registers:
             register = registers[int(rng.integers(len(registers)))]
@@ -169,7 +172,7 @@ class Code:
         return bool(found.group(cx86.X86_GRP_JUMP)) and found.mnemonic != "jmp"
 
     def memory_operand(self, address: int, run: Emulation) -> int:
-        """Address of the memory operand of an instruction that is about to execute."""
+        """Return the address of the memory operand of an instruction that is about to execute."""
         found = self.instructions[address]
         place = next(o.mem for o in found.operands if o.type == cx86.X86_OP_MEM)
         value = place.disp + (found.size if found.reg_name(place.base) == "rip" else 0)
@@ -181,7 +184,7 @@ class Code:
 
 
 def inverted(flags: int, jump: str) -> int:
-    """The flags with those changed that make a conditional jump go the other way."""
+    """Return the flags, changed so that a conditional jump goes the other way."""
     condition = jump.removeprefix("j")
     carry, zero, sign, overflow = (flags >> bit & 1 for bit in (CARRY, ZERO, SIGN, OVERFLOW))
     if condition in ("be", "a"):
@@ -201,7 +204,10 @@ def inverted(flags: int, jump: str) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
-    """What a fault did; `before` and `after` are the values of the whole register, if it is one."""
+    """The outcome of a fault, and the values of the whole register before and after the flip.
+
+    The values are None for a fault in memory.
+    """
 
     outcome: str
     output_sha256: str
@@ -212,7 +218,7 @@ class Result:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bench:
-    """A program that is ready to be struck."""
+    """A program with its golden run and its executed instructions, ready for faults."""
 
     snapshot: Snapshot
     code: Code
@@ -223,11 +229,11 @@ class Bench:
 
     @classmethod
     def of(cls, program: Path, hang_ratio: int = HANG_RATIO) -> Bench:
-        """Run a program once without a fault, and once to count executions."""
+        """Run a program once for the golden run, and once to count executions."""
         snapshot, code = take_snapshot(program), Code(program)
         golden = Emulation(snapshot).finish(1 << 40)
         if golden.exit_code != 0:
-            raise RuntimeError(f"{program.name} ends by itself: {golden}")
+            raise RuntimeError(f"{program.name} fails without a fault: {golden}")
         start = snapshot.bias + code.first
         counts = Emulation(snapshot).count_executions(start, start + len(code.data) - 1)
         addresses = np.array(code.targets(), np.int64)
@@ -237,7 +243,7 @@ class Bench:
         )  # fmt: skip
 
     def draw(self, seed: int, number: int) -> Fault:
-        """Draw a fault, uniformly over the executions."""
+        """Draw the fault with a number, uniformly over all executed instructions."""
         rng = np.random.default_rng([seed, number])
         ends = np.cumsum(self.executions)
         position = int(rng.integers(ends[-1]))
@@ -247,10 +253,10 @@ class Bench:
         return Fault(address=address, k=k, struck=self.code.draw(address, rng))
 
     def strike(self, fault: Fault) -> Result:
-        """Run the program with a fault."""
+        """Run the program with a fault, and return what the fault did."""
         run = Emulation(self.snapshot)
         if not run.run_to(self.snapshot.bias + fault.address, fault.k):
-            raise RuntimeError(f"{fault} is never reached")
+            raise RuntimeError(f"{fault}: the program never reaches the instruction")
         before, after = self._flip(run, fault)
         ended = run.finish(self.hang_ratio * self.golden.blocks)
         return Result(
@@ -274,7 +280,7 @@ class Bench:
             after = inverted(before, struck.jump)
         run[register] = after
         if run[register] != after:
-            raise RuntimeError(f"{fault}: the flip is lost")
+            raise RuntimeError(f"{fault}: the register does not keep the flipped value")
         return before, after
 
     def _outcome(self, ended: End) -> str:
@@ -291,7 +297,7 @@ class Bench:
 
 
 def build(source: Path, folder: Path) -> Path:
-    """Compile a program by the command that its source names."""
+    """Compile a program with the command in a comment of its source. Return the program's path."""
     command = re.search(r"^ \* +(gcc .+)$", source.read_text(), re.MULTILINE)
     assert command is not None, f"{source} names no command"
     shutil.copy(source, folder)
@@ -300,7 +306,7 @@ def build(source: Path, folder: Path) -> Path:
 
 
 def inject(program: Path, out: Path, *, runs: int, jobs: int) -> list[dict[str, Any]]:
-    """Let mavfi inject faults; its records."""
+    """Have mavfi inject faults into a program, and return the records, sorted by run."""
     command = [
         sys.executable, "-m", "mavfi_cli", "kernels", "--program", str(program),
         "--compat", "pinfi", "--runs", str(runs),
@@ -313,7 +319,7 @@ def inject(program: Path, out: Path, *, runs: int, jobs: int) -> list[dict[str, 
 
 
 def recorded_fault(record: dict[str, Any]) -> Fault:
-    """Read the fault that mavfi has recorded."""
+    """Return the fault that a record of mavfi contains."""
     address, corruption = record["offset"], record["corruption"]
     site, bits = corruption["site"], tuple(corruption["bits"])
     if site == "memory":
@@ -331,18 +337,18 @@ def recorded_fault(record: dict[str, Any]) -> Fault:
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """The faults of the emulator for one program; forks of this process do them."""
+    """The faults that the emulator injects into one program, in forks of this process."""
 
     bench: Bench
     seed: int
 
     def own(self, number: int) -> dict[str, Any]:
-        """Strike an own fault."""
+        """Draw and inject one of the emulator's own faults. Return fault and result as a dict."""
         fault = self.bench.draw(self.seed, number)
         return {"run": number, **asdict(fault), **asdict(self.bench.strike(fault))}
 
     def repeated(self, record: dict[str, Any]) -> dict[str, Any]:
-        """Strike a fault that mavfi has recorded, and compare."""
+        """Inject a fault that mavfi has recorded. Return fault, result and differences."""
         fault = recorded_fault(record)
         result = self.bench.strike(fault)
         return {
@@ -352,7 +358,7 @@ class Work:
 
 
 def differences(record: dict[str, Any], result: Result) -> list[str]:
-    """What differs between a recorded run of mavfi and its repetition in the emulator."""
+    """Return the values that differ between a run of mavfi and its repetition in the emulator."""
     found = [] if record["outcome"] == result.outcome else ["outcome"]
     finished = result.outcome in ("benign", "sdc")
     if finished and not found and record["output_sha256"] != result.output_sha256:
@@ -383,7 +389,10 @@ def _number(item: Any) -> int:
 def in_parallel(
     function: Callable[[Any], dict[str, Any]], items: Sequence[Any], path: Path, jobs: int
 ) -> list[dict[str, Any]]:
-    """Apply a function to what the file does not hold yet, in forks; all results by run."""
+    """Apply a function, in forks, to the items whose results are not in a file yet.
+
+    The file gets the new results. Return all results in the file, sorted by run.
+    """
     path.touch()
     done = [json.loads(line) for line in path.read_text().splitlines()]
     known = {each["run"] for each in done}
@@ -400,7 +409,10 @@ def in_parallel(
 
 
 def newcombe(a: int, m: int, b: int, n: int) -> tuple[float, float, float]:
-    """Difference of two shares with its 95 % interval (R. G. Newcombe, Stat. Med. 17, 1998)."""
+    """Return the difference of the shares a / m and b / n, and the ends of its 95 % interval.
+
+    The interval is that of R. G. Newcombe, Stat. Med. 17, 1998.
+    """
     first, second = wilson(a, m), wilson(b, n)
     low = math.hypot(first.share - first.low, second.high - second.share)
     high = math.hypot(first.high - first.share, second.share - second.low)
@@ -409,7 +421,7 @@ def newcombe(a: int, m: int, b: int, n: int) -> tuple[float, float, float]:
 
 
 def shares_table(name: str, ours: list[str], theirs: list[str]) -> None:
-    """Print the shares of outcomes of both."""
+    """Print the share of each outcome in mavfi and in the emulator, and their difference."""
     print(f"\n{name}: {len(ours)} runs of mavfi, {len(theirs)} of the emulator")
     for outcome in OUTCOMES:
         a, b = ours.count(outcome), theirs.count(outcome)
@@ -423,7 +435,7 @@ def shares_table(name: str, ours: list[str], theirs: list[str]) -> None:
 def compare(
     source: Path, folder: Path, *, runs: int, emulated: int, pairs: int, jobs: int, hang_ratio: int
 ) -> list[list[Any]]:
-    """Compare both on a program; the rows of its counts."""
+    """Compare mavfi and the emulator on one program. Return the rows of its counts."""
     name, program = source.stem, build(source, folder)
     work = Work(bench=Bench.of(program, hang_ratio), seed=1)
     print(f"{name}: {work.bench.executions.sum()} executed instructions that count")
@@ -448,7 +460,7 @@ def compare(
 
 
 def main() -> None:
-    """Compare, and write the counts."""
+    """Compare mavfi and the emulator on all programs, and write the counts."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--runs", type=int, default=5000, help="of mavfi")

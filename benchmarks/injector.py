@@ -1,11 +1,11 @@
-"""Cost of the instruction-level injector on a small kernel-like program.
+"""Measures the cost of the instruction-level injector on a small kernel-like program.
 
     python benchmarks/injector.py [--runs 400]
 
-Prints injections per hour and core (hangs included, as they cost most), the stop time (target
-halted, operand read, flipped, written, read back), the cost of one counted execution for both
-mechanisms, the single-step rate, and what a run costs before its first instruction. Targets:
-50,000 injections per hour and core for small kernels, stop median under 0.2 ms and 99th
+Prints the injections per hour and core (including hangs, which cost most), the stop time (to halt
+the target, and to read, flip, write and read back the operand), the cost of one counted execution
+for each mechanism, and the times to profile the program and to start a traced run. Targets: 50,000
+injections per hour and core for small kernels, a median stop time under 0.2 ms and a 99th
 percentile under 1 ms.
 """
 
@@ -52,7 +52,7 @@ int main(int c, char **argv) {
 
 
 def build(folder: Path) -> Path:
-    """Compile the program."""
+    """Compile the program, and return its path."""
     compiler = shutil.which("gcc")
     if compiler is None:
         raise SystemExit("error: gcc is not installed")
@@ -63,7 +63,7 @@ def build(folder: Path) -> Path:
 
 
 def target_of(program: Path, ticks: int, mechanism: Mechanism | None = None) -> ProgramTarget:
-    """The program as a target."""
+    """Return the program as a target of the injector, with a number of ticks to compute."""
     return ProgramTarget(
         command=Program.of([str(program), str(ticks)]),
         comparison=OutputComparison(),
@@ -72,13 +72,16 @@ def target_of(program: Path, ticks: int, mechanism: Mechanism | None = None) -> 
 
 
 def milliseconds(seconds: list[float]) -> str:
-    """Median and 99th percentile."""
+    """Return the median and the 99th percentile of some times as text, in milliseconds."""
     median, high = np.percentile(seconds, [50, 99]) * 1e3
     return f"median {median:.3f} ms, 99th percentile {high:.3f} ms"
 
 
 def seconds_per_hit(program: Path, mechanism: Mechanism) -> float:
-    """Slope of the time to reach the k-th execution, over k."""
+    """Return the time that a mechanism takes to count one execution, in seconds.
+
+    It is the slope of the time to reach the k-th execution, over k.
+    """
     place = target_of(program, 3000, mechanism).open()
     counts, took = [1, 500, 1000, 2000], []
     for count in counts:
@@ -98,7 +101,10 @@ def seconds_per_hit(program: Path, mechanism: Mechanism) -> float:
 
 
 def starts(program: Path, runs: int = 40) -> tuple[list[float], list[float]]:
-    """Times to start a program traced, at its entry point, and to run it plainly."""
+    """Return the times, in seconds, to start the traced program, and to run it without tracing.
+
+    A traced start ends at the program's entry point.
+    """
     place = target_of(program, 50).open()
     traced, plain = [], []
     for _ in range(runs):
@@ -114,7 +120,7 @@ def starts(program: Path, runs: int = 40) -> tuple[list[float], list[float]]:
 
 
 def summarise(campaign: TargetRuns, say: Callable[[str], None]) -> None:
-    """The figures of a campaign."""
+    """Pass the figures of a campaign to `say`, line by line."""
     records = campaign.records
     total = sum(entry["run_s"] for entry in records)
     quick = [e["run_s"] for e in records if e["outcome"] != RunOutcome.HANG.value]
@@ -132,7 +138,7 @@ def summarise(campaign: TargetRuns, say: Callable[[str], None]) -> None:
 
 
 def main() -> None:
-    """Run all of it."""
+    """Run all measurements, and print them."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=400)
     runs = parser.parse_args().runs

@@ -1,4 +1,4 @@
-"""Is the injector exact? Predicted outputs, chi-square of drawn instructions, planned bits.
+"""Checks that the injector is exact: predicted outputs, drawn instructions, flipped bits.
 
     python benchmarks/injector_exact.py [--faults 2000] [--draws 20000] [--kernel NAME ...]
 
@@ -75,7 +75,7 @@ MOST_HITS = 20_000  # of an instruction whose executions are counted one by one
 
 
 def predicted(execution: int, bit: int) -> str:
-    """What the program prints if the bit is flipped in one round, from 1."""
+    """Return what the program prints if a bit is flipped in one round. Rounds count from 1."""
     total = 1
     for number in range(ROUNDS):
         taken = number ^ (1 << bit) if number + 1 == execution else number
@@ -84,7 +84,10 @@ def predicted(execution: int, bit: int) -> str:
 
 
 def exact_stops(faults: int, rng: np.random.Generator) -> tuple[int, int]:
-    """Strike drawn executions of one instruction; return how many predictions were met."""
+    """Inject faults into random executions of one instruction, and compare the program's output.
+
+    Return the number of outputs that were as predicted, and the number of faults.
+    """
     compiler = shutil.which("gcc")
     if compiler is None:
         raise SystemExit("error: gcc is not installed")
@@ -107,7 +110,10 @@ def exact_stops(faults: int, rng: np.random.Generator) -> tuple[int, int]:
 
 
 def taken_fault(profile: TargetProfile):
-    """Function from execution and bit to a fault in the register that `take` sets."""
+    """Return a function that makes a fault in the register that `take` sets.
+
+    The function takes the number of the execution and the bit to flip.
+    """
     (segment,) = profile.strata[0].segments
     for address in map(int, segment.trace):
         instruction = decode(profile.code_at(address), address)
@@ -133,7 +139,7 @@ def taken_fault(profile: TargetProfile):
 
 
 def counted(place: Any, address: int) -> int:
-    """Executions of an instruction in one undisturbed run, before its end is written."""
+    """Return how often an instruction executes in one undisturbed run."""
     tracee = place.start()
     try:
         return tracee.count_to_end(address)
@@ -142,7 +148,10 @@ def counted(place: Any, address: int) -> int:
 
 
 def chi_square(place: Any, profile: TargetProfile, draws: int, rng: np.random.Generator) -> str:
-    """Chi-square of drawn instructions against the counts of a run that was not stepped."""
+    """Return a chi-square test, as text, of drawn instructions against counted executions.
+
+    The executions are counted in runs that are not single-stepped.
+    """
     addresses = sorted({int(each) for each in profile.strata[0].segments[0].trace})
     counts = np.array([counted(place, address) for address in addresses])
     plan = Strategy.of("instruction-uniform", FaultModel(sites=frozenset((Site.OPCODE,))))
@@ -162,7 +171,10 @@ def chi_square(place: Any, profile: TargetProfile, draws: int, rng: np.random.Ge
 
 
 def estimates(place: Any, profile: TargetProfile, number: int, rng: np.random.Generator) -> str:
-    """The counts of sampled instructions over their estimates, and how many are in the interval."""
+    """Compare the counts of sampled instructions with their estimates. Return a line of text.
+
+    The line says how many counts are within the interval of the estimate.
+    """
     traces = [[segment.trace for segment in stratum.segments] for stratum in profile.strata]
     addresses = np.unique(np.concatenate([trace for some in traces for trace in some]))
     inside, ratios = 0, []
@@ -187,7 +199,7 @@ def estimates(place: Any, profile: TargetProfile, number: int, rng: np.random.Ge
 
 
 def planned_bits(records: Sequence[Record]) -> tuple[int, int]:
-    """In how many of the applied flips exactly the planned bits changed."""
+    """Return in how many applied flips exactly the planned bits changed, and how many there are."""
     exact = applied = 0
     for entry in records:
         injection = entry["injection"]
@@ -199,7 +211,10 @@ def planned_bits(records: Sequence[Record]) -> tuple[int, int]:
 
 
 def same_by_breakpoints(target: KernelTarget, records: Sequence[Record]) -> tuple[int, int]:
-    """Of the runs in which a detour counted, how many are the same without one, and all of them."""
+    """Repeat, without a detour, the runs in which a detour counted executions.
+
+    Return how many of these runs are the same, and how many there are.
+    """
     detoured = [entry for entry in records if any("detour" in stage for stage in entry["trigger"])]
     same = 0
     with one_processor(), closing(target.open()) as place:
@@ -213,14 +228,17 @@ def same_by_breakpoints(target: KernelTarget, records: Sequence[Record]) -> tupl
 
 
 def seen(entry: Record) -> list[Any]:
-    """What a record says about a run, without the flag that a breakpoint leaves in rflags."""
+    """Return the values of a record to compare.
+
+    The flag that a breakpoint leaves in rflags is cleared.
+    """
     injection = entry["injection"]
     values = [int(injection.get(key, "0"), 16) & ~RESUME_FLAG for key in ("before", "after")]
     return values + [entry[key] for key in ("outcome", "signal", "output_sha256", "activation")]
 
 
 def main() -> None:
-    """Run all of it."""
+    """Run all checks, and print their results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--faults", type=int, default=2000)
     parser.add_argument("--draws", type=int, default=20_000)

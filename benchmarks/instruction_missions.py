@@ -1,14 +1,14 @@
-"""What an instruction-level fault costs a whole mission, node by node.
+"""Measures how much longer a whole mission takes with an instruction-level fault, per node.
 
     python benchmarks/instruction_missions.py [--pairs 7] [--fault-seeds 1] [--node NAME ...]
 
-For each attacked kernel (the planner three times) and fault seed: the first command, which draws
-the fault and keeps its profile (the first of a mission also keeps its golden flight); then pairs of
-whole commands in turn, the golden mission and the one with the fault. Printed are medians, their
-ratio with the range over the pairs, the same for processor time, and how long the first took.
-Target: at most 1.3 times the wall time. `--null` injects without the flip, so that both fly the
-same flight; else a faulty flight that is longer or shorter shows in the ratio. All missions fly the
-stack `hardened`.
+For each attacked kernel (with three planners) and fault seed, a first command draws the fault and
+keeps the kernel's profile (the first command of a mission also keeps its golden flight). Then the
+golden mission and the mission with the fault are flown in turn, each by a whole command. The output
+has the medians of their wall times, the ratio of the medians with its range over the pairs, the
+same for processor time, and the time of the first command. Target: at most 1.3 times the wall time.
+`--null` injects without the flip, so that both missions are the same flight; otherwise a longer or
+shorter faulty flight affects the ratio. All missions fly the stack `hardened`.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ PLANNERS = ("rrtstar", "rrt", "rrtconnect")
 
 
 def ratio(attacked: list[float], golden: list[float]) -> str:
-    """Of the medians, and the range over the pairs."""
+    """Return the ratio of the medians as text, with the range of the ratio over the pairs."""
     each = sorted(a / g for a, g in zip(attacked, golden, strict=True))
     middle = statistics.median(attacked) / statistics.median(golden)
     return f"{middle:.2f} ({each[0]:.2f} to {each[-1]:.2f})"
 
 
 def row(node: str, seed: int, given: argparse.Namespace, out: str) -> str:
-    """One line of the table."""
+    """Measure one node and fault seed, and return a row of the table."""
     planner = node if node in PLANNERS else "rrtstar"
     plain = ["--world", given.world, "--seed", str(given.seed), "--planner", planner, "--out", out]
     plain += ["--stack", "hardened"]
@@ -54,7 +54,7 @@ def row(node: str, seed: int, given: argparse.Namespace, out: str) -> str:
 
 
 def main() -> None:
-    """Measure and print a table."""
+    """Measure all nodes, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pairs", type=int, default=7)
     parser.add_argument("--fault-seeds", type=int, default=1)

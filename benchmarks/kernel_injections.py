@@ -1,14 +1,15 @@
-"""Instruction-level injections in our own kernels: how many an hour, and where the time goes.
+"""Measures instruction-level injections in our kernels: how many per hour, and where time goes.
 
     python benchmarks/kernel_injections.py [--runs 100] [--replays 50] [--kernel NAME ...]
 
-For each kernel: exact injections per hour and core (sum of the runs' durations, hangs included; and
-with the preparation spread over 5,000 runs), the same per hour of processor time (of tracer,
-template and runs, which other programs on the machine change less), the share of a run that goes
-into process start, the counted executions and the golden computation, the stop time, and how many
-of the replays came out identical. Targets: 50,000 an hour for PID and point cloud, 5,000 for
-OctoMap and RRT*; stop median under 0.2 ms, 99th percentile under 1 ms; 1,000 identical replays over
-all kernels. What a null injection costs is measured by `kernel_null.py`.
+Prints for each kernel the injections per hour and core (by the sum of the runs' durations,
+including hangs; and with the preparation spread over 5,000 runs), the injections per hour of
+processor time (of tracer, template and runs, which other programs on the machine affect less), the
+shares of a run's time that go into process start, the golden computation and the rest, the stop
+time, and how many of the replays were identical. Targets: 50,000 injections per hour for PID and
+point cloud, 5,000 for OctoMap and RRT*; a median stop time under 0.2 ms, and a 99th percentile
+under 1 ms; 1,000 identical replays over all kernels. `kernel_null.py` measures the cost of a null
+injection.
 """
 
 from __future__ import annotations
@@ -33,7 +34,10 @@ from mavfi_cli.spec.mission import MissionConfig
 
 
 def starts(place: Any, runs: int = 4) -> tuple[float, float]:
-    """Mean time to have a run ready for its trigger, and mean CPU time of its undisturbed call."""
+    """Return the mean time to start a run, and the mean CPU time of its undisturbed call.
+
+    Both are in seconds. A run has started when it is ready for its trigger.
+    """
     ready, call = [], []
     for where in place.inputs * runs:
         begun = time.perf_counter()
@@ -46,7 +50,7 @@ def starts(place: Any, runs: int = 4) -> tuple[float, float]:
 
 
 def used_s() -> float:
-    """Processor time of this process and its children, ended ones included."""
+    """Return the processor time, s, of this process and its children, including ended ones."""
     spent_s = time.process_time()
     for child in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split():
         fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
@@ -55,7 +59,7 @@ def used_s() -> float:
 
 
 def measure(plan: Plan, target: KernelTarget, folder: Path, replays: int) -> tuple[int, int]:
-    """Print the figures of one kernel; identical replays and all replays."""
+    """Print the figures of one kernel. Return the numbers of identical and of all replays."""
     used: list[float] = []  # from the first run's end on
     (runs,) = run_campaign(
         plan, [target], folder=folder,
@@ -97,7 +101,7 @@ def measure(plan: Plan, target: KernelTarget, folder: Path, replays: int) -> tup
 
 
 def main() -> None:
-    """Run all of it."""
+    """Measure all selected kernels, and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--replays", type=int, default=50)

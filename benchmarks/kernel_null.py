@@ -1,24 +1,24 @@
-"""What a null injection costs a kernel outside of its counted window, in pairs.
+"""Measures what a null injection costs a kernel outside its counted window, in paired runs.
 
     python benchmarks/kernel_null.py [--rounds 300] [--kernel NAME ...]
 
-Every round runs the same call from the same memory once in each of these ways, every second round
-in the opposite order:
+Every round runs the same call from the same memory once in each of these ways, and every second
+round runs them in the opposite order:
 
-    free      nobody traces it
-    ended     traced, nothing armed: its counted window was over before the call
-    armed     traced, a counter armed that counts nothing in this call: its window is yet to begin
-    counted   traced, every entry into the kernel counted by a breakpoint: in the window
-    detoured  traced, every entry counted by a detour, if one fits there
-    stopped   stopped at its first entry for a null injection, then nobody traces it
-    after     stopped at its first entry for a null injection, then traced to the end
+    free      not traced
+    ended     traced, with nothing armed: the counted window was over before the call
+    armed     traced, with a counter armed that counts nothing: the window has not begun yet
+    counted   traced, with every entry into the kernel counted by a breakpoint: in the window
+    detoured  traced, with every entry counted by a detour, if a detour fits there
+    stopped   stopped at the first entry for a null injection, then not traced
+    after     stopped at the first entry for a null injection, then traced to the end
 
-Outside of the window a null injection costs `armed` over `free` before it and `after` over
-`stopped` after it; `ended` over `free` is what tracing alone costs, `detoured` over `free` what it
-costs to count all entries to a late one. Each is the median over all rounds of the ratio of CPU
-times of the call within a round, with a 95 % bootstrap interval. Target: less than 1 %. What the
-window itself costs is told beside: the stop (`stopped` less `free`) and one execution that a
-breakpoint counts (`counted` less `armed`, over the entries).
+Outside the window, a null injection costs `armed` over `free` before the window, and `after` over
+`stopped` after it. `ended` over `free` is the cost of tracing alone, and `detoured` over `free` is
+the cost of counting all entries up to a late one. Each cost is the median over all rounds of the
+ratio of the call's CPU times within a round, with a 95 % bootstrap interval. Target: less than 1 %.
+The cost of the window itself is printed as well: that of the stop (`stopped` minus `free`), and
+that of one execution that a breakpoint counts (`counted` minus `armed`, divided by the entries).
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ NOWHERE = 0x1000  # nothing is mapped there
 
 
 def finish(tracee: Tracee) -> None:
-    """Traced, run to the end."""
+    """Run a traced process to its end."""
     while tracee.ended is None:
         tracee.resume()
 
 
 def finish_alone(tracee: Tracee) -> None:
-    """Not traced any more, run to the end."""
+    """Detach from a traced process, and wait for its end."""
     process = os.pidfd_open(tracee.pid)
     try:
         tracee.detach()
@@ -66,7 +66,7 @@ def finish_alone(tracee: Tracee) -> None:
 
 
 def run(place: Any, way: str, detour: Detour | None) -> float:
-    """CPU time of one call, s."""
+    """Run one call in one of the ways. Return the call's CPU time in seconds."""
     tracee = place.start()
     entry = place.image(tracee).address(place.kernel_scope.entry)
     if way in ("armed", "counted"):
@@ -87,7 +87,7 @@ def run(place: Any, way: str, detour: Detour | None) -> float:
 
 
 def ratio(over: np.ndarray, under: np.ndarray) -> str:
-    """Median of paired ratios less 1, with its bootstrap interval."""
+    """Return the median of paired ratios minus 1 as text, with its 95 % bootstrap interval."""
     pairs = over / under - 1.0
     rng = np.random.default_rng(1)
     medians = np.median(rng.choice(pairs, (4000, len(pairs))), axis=1)
@@ -96,7 +96,7 @@ def ratio(over: np.ndarray, under: np.ndarray) -> str:
 
 
 def measure(name: str, inputs: Path, rounds: int) -> None:
-    """Print the figures of one kernel."""
+    """Measure one kernel in all ways, and print its row of the table."""
     target = KernelTarget(kernel=name, inputs=inputs)
     with one_processor(), closing(target.open()) as place:
         tracee = place.start()
@@ -118,7 +118,7 @@ def measure(name: str, inputs: Path, rounds: int) -> None:
 
 
 def main() -> None:
-    """Run all of it."""
+    """Measure all selected kernels, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=300)
     parser.add_argument("--kernel", action="append", default=[])

@@ -1,9 +1,9 @@
-"""Every form of instruction that our kernels execute, by one example, for the tests of masks.
+"""Prints one example of every form of instruction that our kernels execute, to test masks.
 
     python benchmarks/kernel_opcodes.py > tests/fi/tracer/kernel_opcodes.txt
 
-A form is a mnemonic with the kinds and widths of its operands, which of them are the same register,
-and the immediate of a shuffle.
+The tests check the bits that these instructions read and write. A form is a mnemonic with the kinds
+and widths of its operands, which of them are the same register, and the immediate of a shuffle.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _HEAD = (
 
 
 def form_of(found: Any) -> tuple[str, ...]:
-    """What the masks of an instruction may depend on."""
+    """Return the form of an instruction: everything on which its masks may depend."""
     names: list[str] = []
     kinds = [found.mnemonic, "evex" if found.bytes[0] == 0x62 else ""]
     for op in found.operands:
@@ -51,7 +51,7 @@ def form_of(found: Any) -> tuple[str, ...]:
 
 
 def main() -> None:
-    """Step all kernels and print the forms."""
+    """Single-step all kernels, and print an example of every form that they execute."""
     engine = capstone.Cs(capstone.CS_ARCH_X86, capstone.CS_MODE_64)
     engine.detail = True
     forms: dict[tuple[str, ...], str] = {}

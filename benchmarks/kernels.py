@@ -1,9 +1,9 @@
-"""What each kernel of the autonomy costs, in CPU milliseconds a call, in a dense world.
+"""Measures the CPU time per call of each kernel of the autonomy, in a dense world.
 
     python benchmarks/kernels.py [--seed 10]
 
-A vehicle that follows its trajectories perfectly flies the mission; every kernel is called as
-often as a flight calls it (perception 3.5 times a simulated second, control 50 times).
+A vehicle that follows its trajectories perfectly flies the mission. Every kernel is called as often
+as in a real flight (per simulated second, perception 3.5 times and control 50 times).
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ LEAD_S = 0.26
 
 
 class Stopwatch:
-    """CPU time by name."""
+    """Records the CPU times of calls, keyed by name."""
 
     def __init__(self) -> None:
         self.spent_s: dict[str, list[float]] = defaultdict(list)
 
     def call(self, name, function, *arguments):
-        """Call and note the time."""
+        """Call a function, record its CPU time under a name, and return its result."""
         begin = time.process_time()
         result = function(*arguments)
         self.spent_s[name].append(time.process_time() - begin)
@@ -45,12 +45,12 @@ class Stopwatch:
 
 
 class Flight:
-    """One mission, its vehicle always where its trajectory says.
+    """One mission of a vehicle that is always exactly on its trajectory.
 
     Args:
-        world: with start, goal and boxes.
-        seed: of the planner.
-        watch: times every kernel.
+        world: World with start, goal and boxes.
+        seed: Seed of the planner.
+        watch: Stopwatch that times every kernel.
     """
 
     def __init__(self, world: World, seed: int, watch: Stopwatch) -> None:
@@ -67,7 +67,7 @@ class Flight:
         self._plans = 0
 
     def fly(self) -> float:
-        """Fly to the goal; the simulated duration, s."""
+        """Fly to the goal, and return the simulated duration in seconds."""
         for tick in range(10_000):
             now_s = tick * TICK_S
             if tick % TICKS_A_FRAME == 0:
@@ -85,7 +85,7 @@ class Flight:
         return now_s - self._trajectory.stamp_s if self._trajectory else 0.0
 
     def _perceive(self, now_s: float) -> tuple[MapSnapshot, bool]:
-        """From a depth frame to the newest map, and whether the trajectory is blocked in it."""
+        """Add a depth frame to the map. Return the map, and whether it blocks the trajectory."""
         attitude = quaternion_from_euler(0.0, 0.0, self._yaw)
         boxes = self._world.boxes_enu_m
         levels = render_depth(boxes, self._position, attitude, 64, 48, math.pi / 2)
@@ -116,7 +116,7 @@ class Flight:
         return snapshot, report.collision
 
     def _plan(self, now_s: float, snapshot: MapSnapshot) -> None:
-        """From where the vehicle will be when the plan is there."""
+        """Plan from the point where the vehicle will be when the plan takes effect."""
         start, velocity = self._position, np.zeros(3)
         if self._trajectory is not None:
             row = reference_waypoint(self._trajectory, self._flown_s(now_s) + LEAD_S)
@@ -141,7 +141,7 @@ class Flight:
         self._next = found if isinstance(found, Trajectory) else None
 
     def _track(self, now_s: float) -> None:
-        """One control tick; then the vehicle is where it should be."""
+        """Run one control tick, then move the vehicle to the trajectory's current point."""
         inputs = tracking.TrackingInputs(
             stamp_s=now_s,
             position_enu_m=self._position,
@@ -160,7 +160,7 @@ class Flight:
 
 
 def main() -> None:
-    """Fly, and print the table."""
+    """Fly the mission, and print the table of kernels."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--world", default="dense")
     parser.add_argument("--seed", type=int, default=10)

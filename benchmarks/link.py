@@ -1,10 +1,11 @@
-"""CPU time of the MAVLink link on the bytes of one golden flight, without the flight.
+"""Measures the CPU time of the MAVLink link on the bytes of one golden flight, without flying.
 
     python benchmarks/link.py [--repeats 9] [--tlog flight.tlog]
 
 Both ends do what they do in a flight. The vehicle encodes its messages and decodes the companion's.
-The companion decodes, assembles images, keeps telemetry, sends a setpoint a tick and writes the
-tlog. What else the machine does hardly changes the best repeat, but it changes shares of a flight.
+The companion decodes messages, assembles images, keeps telemetry, sends a setpoint per tick and
+writes the tlog. Other load on the machine hardly affects the best repeat, whereas it would affect
+the shares of time in a flight.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ COMPANION = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 
 
 def vehicle_ticks(tlog: bytes) -> list[tuple[float, bytes]]:
-    """Stamp, s, and bytes of everything that the vehicle sent in a tick."""
+    """Return the stamp of every tick, s, and the bytes that the vehicle sent in it."""
     ticks: dict[float, list[bytes]] = {}
     place = 0
     while place < len(tlog):
@@ -41,7 +42,7 @@ def vehicle_ticks(tlog: bytes) -> list[tuple[float, bytes]]:
 
 
 def link_cpu_s(ticks: list[tuple[float, bytes]], sent: list[Message], tlog: Path) -> float:
-    """CPU time of both ends for the ticks of a flight."""
+    """Return the CPU time, in seconds, of both ends of the link for the ticks of a flight."""
     ours, theirs = memory_pair("the benchmark")
     link, vehicle = RecordedLink(ours, 1, COMPANION), Codec(1, 1)
     session = OffboardSession(SessionSettings(takeoff_height_m=5.0, request_streams=False))
@@ -66,7 +67,7 @@ def link_cpu_s(ticks: list[tuple[float, bytes]], sent: list[Message], tlog: Path
 
 
 def main() -> None:
-    """Fly once, or read a tlog; repeat its link work; print the best and the median."""
+    """Fly once or read a tlog, repeat the work on its link, and print the best and median time."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--tlog", type=Path)

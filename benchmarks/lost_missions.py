@@ -1,12 +1,12 @@
-r"""Lost and longer missions of flown campaigns, cell by cell.
+r"""Counts the lost and the longer missions of flown campaigns, per cell.
 
     python benchmarks/lost_missions.py docs/results/effects-part*.parquet \
         --by label_setting world label_field
 
-Reads exports of campaigns (`mavfi campaign export`). A cell counts the missions whose fault was
-read. A mission is lost if it does not end in success. It is longer if it succeeds and takes more
-than 10 % longer than its own golden flight: the flight of the setting `golden` with the same world,
-world seed, seed, stack and platform. Intervals are Wilson's, 95 %.
+Reads exports of campaigns (`mavfi campaign export`). A cell counts golden missions, and missions
+whose fault was read. A mission is lost if it does not end in success. It is longer if it succeeds
+and takes more than 10 % longer than its own golden flight: the flight without a fault with the same
+world, world seed, seed, stack and platform. Intervals are Wilson's, 95 %.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PAIRED = ("world", "world_seed", "seed", "stack", "platform")
 
 
 def lines(rows: list[Row], by: Iterable[str]) -> list[str]:
-    """A line for each cell."""
+    """Return a row of the table for each cell, which is a combination of values of the columns."""
     golden = {key(r, PAIRED): r["flight_time_s"] for r in rows if r["injected"] == "golden"}
     cells: dict[tuple[str, ...], list[Row]] = collections.defaultdict(list)
     for row in rows:
@@ -43,7 +43,7 @@ def lines(rows: list[Row], by: Iterable[str]) -> list[str]:
 
 
 def main() -> None:
-    """Read, count, print."""
+    """Read the exports, and print the table."""
     parser = arguments(__doc__)
     parser.add_argument("--by", nargs="+", required=True, help="columns that name a cell")
     given = parser.parse_args()

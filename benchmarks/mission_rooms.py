@@ -1,11 +1,11 @@
-"""The share of each room of the code in a mission's CPU time.
+"""Measures the share of each package of the code in a mission's CPU time.
 
     python benchmarks/mission_rooms.py --missions 40
 
 A timer of the process's own CPU time interrupts the flights. Each sample counts for the innermost
-function of mavfi on the stack, so numpy and pymavlink count for the room that calls them.
-What one flight leaves behind is collected before the next, because a mission of a campaign has a
-process of its own.
+function of mavfi on the stack, so numpy and pymavlink count for the package that calls them.
+Garbage of one flight is collected before the next, because a mission of a campaign has a process of
+its own.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PERIOD_S = 0.001
 
 
 def room(frame: FrameType | None) -> str:
-    """The folder, two deep, of the innermost function of mavfi on the stack."""
+    """Return the package, two folders deep, of the innermost function of mavfi on the stack."""
     while frame is not None:
         path = Path(frame.f_code.co_filename)
         if path.is_relative_to(ROOT) and path.relative_to(ROOT).parts[0] in ("mavfi_cli", "sitl"):
@@ -35,7 +35,7 @@ def room(frame: FrameType | None) -> str:
 
 
 def main() -> None:
-    """Fly, sample, print."""
+    """Sample the flights, and print the share of each package."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--missions", type=int, default=40)
     parser.add_argument("--world", default="dense")

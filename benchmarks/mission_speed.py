@@ -1,10 +1,11 @@
-"""Speed of a golden mission: times real time, and where the host's time goes.
+"""Measures the speed of a golden mission, in times real time, and where the host's time goes.
 
 Prints the tables of docs/results/speed.md:
 
     python benchmarks/mission_speed.py [--runs 7] [--world dense] [--seed 3] [--stack mavbench]
 
-`wait` is one process waiting for the other, and for being woken; the two overlap.
+`wait` is the time in which companion or vehicle waits for the other and to be woken. The two waits
+overlap.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from missions import fly
 
 
 def stages(title: str, results: list[dict[str, Any]], key: str) -> None:
-    """Median host milliseconds a simulated second, by stage."""
+    """Print a table of the median host time of each stage, in ms per simulated second."""
     simulated_s = results[0]["simulated_s"]
     print(f"\n| {title} | ms a simulated second |\n|---|---|")
     names = sorted({name for r in results for name in r["host"][key]})
@@ -30,7 +31,7 @@ def stages(title: str, results: list[dict[str, Any]], key: str) -> None:
 
 
 def main() -> None:
-    """Fly, and print medians."""
+    """Fly the missions, and print medians."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--world", default="dense")

@@ -1,4 +1,4 @@
-"""Whole missions for the benchmarks: each `mavfi fly` in a fresh process, with what it cost."""
+"""Flies whole missions for the benchmarks: `mavfi fly` in a fresh process, with its cost."""
 
 from __future__ import annotations
 
@@ -15,15 +15,18 @@ MAVFI = (sys.executable, "-m", "mavfi_cli")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Flown:
-    """One mission."""
+    """The result of one mission, with its wall and CPU time."""
 
     wall_s: float
-    cpu_s: float  # of all its processes; with those of others that end while it flies
+    cpu_s: float  # of all its processes, and of other children that end while it flies
     result: dict[str, Any]  # its result.json
 
 
 def fly(*options: str) -> Flown:
-    """Fly to the end, without a picture or progress. A command that fails ends the benchmark."""
+    """Fly one mission with options of `mavfi fly`, without a picture or progress.
+
+    A command that fails ends the benchmark.
+    """
     line = [*MAVFI, "fly", *options, "--no-picture", "--quiet", "--json"]
     before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     run = subprocess.run(line, capture_output=True, text=True, check=False)
@@ -36,7 +39,10 @@ def fly(*options: str) -> Flown:
 
 
 def fly_pairs(plain: list[str], attacked: list[str], count: int) -> tuple[list[Flown], list[Flown]]:
-    """Both missions in turn, so that what else the machine does meets both alike."""
+    """Fly two missions in turn, `count` times, and return the flights of each.
+
+    Other load on the machine thus affects both alike.
+    """
     flown: tuple[list[Flown], list[Flown]] = [], []
     for _ in range(count):
         for missions, options in zip(flown, (plain, attacked), strict=True):

@@ -1,4 +1,4 @@
-r"""How nodes end after an instruction-level fault: by a signal, a Python exception, or a hang.
+r"""Counts how nodes end after instruction-level faults: by a signal, a Python exception, a hang.
 
     python benchmarks/node_ends.py docs/results/paper-mavbench.parquet
 
@@ -16,7 +16,7 @@ from exported import Row, arguments, flown, lost
 
 
 def kind_of_end(how: str) -> str:
-    """Return signal, exception or hang for a value of the column `node_ended`."""
+    """Return "signal", "exception" or "hang" for a value of the column `node_ended`."""
     first = how.split(";")[0]
     if first == "hang":
         return "hang"
@@ -25,7 +25,7 @@ def kind_of_end(how: str) -> str:
 
 
 def lines(rows: list[Row]) -> list[str]:
-    """A line for each kernel."""
+    """Return a row of the table for each kernel."""
     kernels: dict[str, list[Row]] = collections.defaultdict(list)
     for row in rows:
         if row["level"] == "instruction" and row["struck_kernel"]:
@@ -41,7 +41,7 @@ def lines(rows: list[Row]) -> list[str]:
 
 
 def main() -> None:
-    """Read, count, print."""
+    """Read the exports, and print the table."""
     given = arguments(__doc__).parse_args()
     print("| kernel | struck | signal | exception | hang | lost after an exception |")
     print("|---" * 6 + "|")

@@ -1,11 +1,11 @@
-"""What OctoMap's shares of outcomes depend on: operands, rule, scans, map, resolution, pruning.
+"""Measures how OctoMap's outcome shares depend on operands, rule, scans, map and resolution.
 
     python benchmarks/octomap_rules.py [--runs 500] [--jobs 2] [--only NAME ...]
 
-The paper (Fig. 6) has OctoMap with under 25 % benign runs and the most silent corruptions of all
-kernels; it names neither input nor operands nor how trees were compared. Each row changes one thing
-against `mavfi kernels --kernel octomap`, and prints the shares with 95 % intervals, and what a
-planner would see of the silent corruptions.
+In the paper (Fig. 6), OctoMap has under 25 % benign runs and the most silent corruptions of all
+kernels. The paper states neither the input nor the operands nor how trees were compared. Each row
+changes one thing with respect to `mavfi kernels --kernel octomap`. It has the shares of outcomes
+with 95 % intervals, and the share of silent corruptions that a planner would see.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ USUAL = {"scans": 1, "empty": False, "resolution_m": 0.2, "lazy": True}
 
 
 def model(**named: list[str]) -> FaultModel:
-    """The fault model with other sites or roles."""
+    """Return the default fault model with other sites or roles."""
     defaults: dict[str, list[str]] = {"sites": [], "roles": []}
     return FaultModel.named(**(defaults | named), field="any", bits=1)
 
@@ -89,7 +89,7 @@ VARIANTS: dict[str, tuple[dict[str, object], dict[str, object]]] = {
 
 
 def main() -> None:
-    """Run all of it."""
+    """Run all selected variants, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=500)
     parser.add_argument("--jobs", type=int, default=2)
@@ -111,7 +111,7 @@ def main() -> None:
 
 
 def cells(told: dict, records: tuple) -> list[str]:
-    """The cells of a row."""
+    """Return the cells of a row, from a variant's summary and its records."""
     outcomes = told["outcomes"]
     shares = [outcomes[name] for name in ("benign", "crash", "hang", "sdc")]
     of = outcomes["benign"]["of"]
@@ -125,7 +125,7 @@ def cells(told: dict, records: tuple) -> list[str]:
 
 
 def cell(share: dict) -> str:
-    """A share with its interval."""
+    """Return a share with its 95 % interval as text."""
     if share["share"] is None:
         return "-"
     low, high = (100.0 * edge for edge in share["wilson95"])

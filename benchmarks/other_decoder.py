@@ -1,4 +1,4 @@
-"""Our decoder beside iced-x86: the bits that instructions read and write, and the time to decode.
+"""Compares our decoder with iced-x86: the bits that instructions access, and the decoding time.
 
     pip install iced-x86==1.21.0
     python benchmarks/other_decoder.py [--differences]
@@ -32,7 +32,7 @@ uses = iced.InstructionInfoFactory()
 
 
 def known_to_iced(code: bytes) -> tuple[Bits, Bits]:
-    """The bits that iced says are read, and those that are written."""
+    """Return the bits that an instruction reads and those that it writes, according to iced."""
     found = iced.Decoder(64, code).decode()
     reads, writes = Bits(), Bits()
     for use in uses.info(found).used_registers():
@@ -51,7 +51,10 @@ def known_to_iced(code: bytes) -> tuple[Bits, Bits]:
 
 
 def known_to_us(code: bytes) -> tuple[Bits, Bits]:
-    """Ours; a write of 32 bits counts with the upper half, as iced has it."""
+    """Return the bits that an instruction reads and those that it writes, by our decoder.
+
+    As in iced, a write of 32 bits to a general register includes the upper half.
+    """
     found = decode(code, 0)
     assert found is not None
     reads, writes = Bits(), Bits()
@@ -66,7 +69,7 @@ def known_to_us(code: bytes) -> tuple[Bits, Bits]:
 
 
 def microseconds(work: Callable[[bytes], object], codes: list[bytes]) -> float:
-    """The least time of five passes, for one instruction."""
+    """Return the time for one instruction, in microseconds: the least of five passes."""
     passes = []
     for _ in range(5):
         begun = time.process_time()
@@ -77,7 +80,7 @@ def microseconds(work: Callable[[bytes], object], codes: list[bytes]) -> float:
 
 
 def main() -> None:
-    """Print what agrees, and the times."""
+    """Print how many instructions agree, and the times of both decoders."""
     lines = [
         line for path in sorted(FOLDER.glob("*.txt")) for line in path.read_text().splitlines()
     ]

@@ -1,9 +1,10 @@
-"""How much of the paper's Tables III and IV is noise: exact tests, and intervals of "recovered".
+"""Tests how much of the paper's Tables III and IV may be noise, from the printed percentages.
 
     python benchmarks/paper_noise.py [--draws 200000] [--seed 1]
 
-The counts are the paper's percentages times the number of its missions. Table IV has 100 golden
-missions and 300 of each other kind in each world, Table III has 100 of each kind.
+Prints exact tests of the success rates, and intervals of the recovered share. The counts are the
+paper's percentages times the number of its missions. Table IV has 100 golden missions and 300
+missions of each other kind in each world, and Table III has 100 missions of each kind.
 """
 
 from __future__ import annotations
@@ -26,31 +27,37 @@ SETTINGS = (
 
 
 def fisher(first, second):
-    """Two-sided p-value of Fisher's exact test of two rates."""
+    """Return the two-sided p-value of Fisher's exact test of two rates.
+
+    A rate is a pair: the number of successes and the number of missions.
+    """
     return fisher_exact([[wins, missions - wins] for wins, missions in (first, second)]).pvalue
 
 
 def share(*keys: object) -> float:
-    """A success rate that the paper prints."""
+    """Return a success rate that the paper prints, as a share. The keys select the number."""
     percent = printed(*map(str, keys))
     assert isinstance(percent, float)
     return percent / 100.0
 
 
 def counts(world: str) -> tuple[int, int, int, int]:
-    """Successes of golden, faulty, Gaussian and autoencoder missions."""
+    """Return the successes of the golden and the faulty missions in a world of Table IV.
+
+    The faulty missions fly without a detector, with the Gaussian one and with the autoencoder.
+    """
     golden, *others = (share("table4", "success_percent", each, world) for each in SETTINGS)
     faulty, gaussian, autoencoder = (round(FAULTY * each) for each in others)
     return round(GOLDEN * golden), faulty, gaussian, autoencoder
 
 
 def of_bits(bits: int) -> tuple[int, int]:
-    """Successes and missions of a row of Table III."""
+    """Return the successes and the missions of the row of Table III for a number of bits."""
     return round(100 * share("table3", "success_percent", bits)), 100
 
 
 def table_iv(draws: int, seed: int) -> None:
-    """Print a line a world, and the pooled one."""
+    """Print a line for each world of Table IV, and a line for all worlds pooled."""
     print(
         f"{'Table IV':<9} {'golden':<8} {'faults':<10} {'p':<7} {'recovered by GAD':<21} "
         f"{'by AAD':<21} GAD against AAD, p"
@@ -76,7 +83,7 @@ def table_iv(draws: int, seed: int) -> None:
 
 
 def table_iii() -> None:
-    """Print what its success rates differ by, beyond chance."""
+    """Print the tests of whether Table III's success rates differ by more than chance."""
     sparse = counts("sparse")[0]
     one, five = of_bits(1), of_bits(5)
     print(f"\nTable III: 1 bit, {one[0]}/100, against")

@@ -1,4 +1,4 @@
-"""How long `mavfi vpm` takes, with and without its pictures, in fresh processes, caches warm.
+"""Measures the time of `mavfi vpm`, with and without pictures, in fresh processes with warm caches.
 
 python benchmarks/performance_model.py [--runs 11]
 """
@@ -17,7 +17,7 @@ LIMIT_S = 2.0
 
 
 def run_s(*options: str) -> float:
-    """Host seconds of one `mavfi vpm`."""
+    """Return the wall time of one `mavfi vpm` with some options, in seconds."""
     begun = time.perf_counter()
     line = [*MAVFI, "vpm", *options]
     subprocess.run(line, capture_output=True, check=True)
@@ -25,7 +25,7 @@ def run_s(*options: str) -> float:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure both, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=11)
     runs = parser.parse_args().runs

@@ -1,6 +1,6 @@
-"""Cost of compiling kernels for x86-64-v3 on every processor, against compiling for this one.
+"""Measures the cost of kernels compiled for x86-64-v3 instead of for this processor.
 
-Flies golden missions in turn with both, and prints a table:
+Flies golden missions in turn with both kinds of kernels, and prints a table:
 
     python benchmarks/processor_level.py [--runs 9] [--world dense] [--stack hardened]
 """
@@ -21,7 +21,7 @@ _LEVELS = {TARGET: TARGET, "this processor": "host"}  # values of NUMBA_CPU_NAME
 
 
 def main() -> None:
-    """Fly in turn, and print medians and the median ratio of neighbouring flights."""
+    """Fly both kinds in turn, and print medians and the median ratio of neighbouring flights."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=9)
     parser.add_argument("--world", default="dense")

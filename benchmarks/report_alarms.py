@@ -1,4 +1,4 @@
-r"""What alarms about collision reports do to flights, with the recovery of two versions.
+r"""Compares what alarms about collision reports do to flights, before and after a new recovery.
 
     python benchmarks/report_alarms.py docs/results/paper-mavbench.parquet \
         docs/results/report-alarms.parquet
@@ -56,7 +56,7 @@ class Missions:
         return None if lost(self._golden[row["pair"]]) else self._unprotected[_fault(row)]
 
     def effect(self, row: Row) -> str:
-        """Return what the detector does to the harm: "undone", "caused" or nothing."""
+        """Return the detector's effect on harm: "undone", "caused", or an empty text for none."""
         bare = self.unprotected(row)
         if bare is None or self.harms(bare) == self.harms(row):
             return ""
@@ -75,13 +75,13 @@ class Missions:
 
 
 def _fault(row: Row) -> str:
-    """The mission without its detector, as text."""
+    """Return a text that identifies a mission without its detector."""
     changes: dict[str, Any] = json.loads(row["changes"])
     return canonical({name: value for name, value in changes.items() if name != "detector"})
 
 
 def table(missions: Missions, again: list[Row]) -> list[str]:
-    """Return the lines of the table, and one line about the missions without an alarm."""
+    """Return the lines of the table, and one line about the missions without such an alarm."""
     cells: dict[Key, collections.Counter[str]] = collections.defaultdict(collections.Counter)
     added_s: dict[tuple[Key, str], list[float]] = collections.defaultdict(list)
     check: collections.Counter[bool] = collections.Counter()

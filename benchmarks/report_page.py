@@ -1,10 +1,10 @@
-"""How long the page of a large campaign takes, and how large it is: `mavfi report`.
+"""Measures how long `mavfi report` takes for a large campaign, and how large its page is.
 
     python benchmarks/report_page.py [--missions 10000] [--keep FOLDER]
 
-Makes a ledger of missions of the paper's Table IV and Fig. 14 from the record of one short flight,
-whose flight time and outcome are drawn. Required of 10,000 missions: less than 30 s and less than
-10 MB.
+Makes a ledger of missions of the paper's Table IV and Fig. 14. Each mission has the record of the
+same short flight, with a random flight time and outcome. Required for 10,000 missions: less than
+30 s and less than 10 MB.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ SHORT = MissionConfig(
 
 
 def record_of_a_flight() -> dict[str, Any]:
-    """The record of the short flight."""
+    """Fly the short mission, and return its record."""
     with tempfile.TemporaryDirectory() as folder:
         return dict(library.fly(SHORT, out=folder).result)
 
 
 def make(folder: Path, missions: int) -> None:
-    """A ledger of so many missions."""
+    """Write a ledger with a number of missions to a folder."""
     record, rng = record_of_a_flight(), np.random.default_rng(1)
     specs = [replace(load_spec(name), repetitions=500) for name in ("table4", "fig14")]
     with Ledger(folder, writing=True) as ledger:
@@ -63,7 +63,7 @@ def make(folder: Path, missions: int) -> None:
 
 
 def main() -> None:
-    """Make the ledger, and time the command."""
+    """Make the ledger unless it exists, and time the command on it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--missions", type=int, default=10_000)
     parser.add_argument("--keep", type=Path, help="folder for ledger and page")

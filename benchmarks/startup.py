@@ -1,6 +1,6 @@
-"""How long one waits: for `mavfi --help`, and from `mavfi fly` to the first control tick.
+"""Measures the wait for `mavfi --help`, and from `mavfi fly` to the first control tick.
 
-Prints medians in fresh processes, caches warm:
+Prints medians over fresh processes with warm caches:
 
     python benchmarks/startup.py [--runs 11]
 """
@@ -21,14 +21,14 @@ FIRST_TICK = "waiting until ready"  # what the first control tick makes the miss
 
 
 def help_s() -> float:
-    """Host seconds of `mavfi --help`."""
+    """Return the wall time of `mavfi --help`, in seconds."""
     begun = time.perf_counter()
     subprocess.run([*MAVFI, "--help"], capture_output=True, check=True)
     return time.perf_counter() - begun
 
 
 def first_tick_s() -> float:
-    """Host seconds from the start of `mavfi fly` to the flight's first control tick."""
+    """Return the wall time from the start of `mavfi fly` to its first control tick, in seconds."""
     with tempfile.TemporaryDirectory() as folder:
         line = [*MAVFI, "fly", "--stack", "hardened", "--world", "dense", "--time-limit", "1",
                 "--no-picture"]  # fmt: skip
@@ -42,11 +42,11 @@ def first_tick_s() -> float:
                     waited_s = time.perf_counter() - begun
                     process.communicate()
                     return waited_s
-    raise SystemExit("the mission ended before its first tick")
+    raise SystemExit("cannot measure the start-up: the mission ended before its first control tick")
 
 
 def row(name: str, limit_s: float, measure: Callable[[], float], runs: int) -> str:
-    """One line of the table."""
+    """Measure `runs` times, and return a row of the table with median, range and limit."""
     measure()  # fills the caches
     times = sorted(measure() for _ in range(runs))
     return (
@@ -56,7 +56,7 @@ def row(name: str, limit_s: float, measure: Callable[[], float], runs: int) -> s
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure both waits, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=11)
     runs = parser.parse_args().runs

@@ -1,11 +1,11 @@
-"""What stratified draws gain on recorded missions, whose rates are known.
+"""Compares stratified with uniform sampling on recorded missions, whose rates are known.
 
     python benchmarks/stratified.py [--missions 200] [--repetitions 200] [EXPORT ...]
 
-The population is the missions of the exports that a fault in an instruction struck, without a
-detector. A stratum is the node and the request of its plan, or the third of the node's invocations.
-Samples of the population are drawn with replacement, uniformly and in the rounds of a stratified
-campaign. The rate is that of lost missions.
+The population consists of the exported missions without a detector in which an instruction-level
+fault struck. A stratum is the kernel that was struck; for planners, it is the first or a later
+planning request instead. Samples of the population are drawn with replacement, uniformly and in the
+rounds of a stratified campaign. The rate is that of lost missions.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Cells = Mapping[str, np.ndarray]  # whether each mission of a stratum is lost
 
 
 def cells(paths: Sequence[Path]) -> dict[str, Cells]:
-    """The strata of faults in planners, and in all nodes."""
+    """Return two populations: the strata of faults in planners, and of faults in all nodes."""
     losses: dict[str, list[bool]] = {}
     names = ["level", "detector", "injected", "struck_kernel", "strike_invocation", "outcome"]
     for path in paths:
@@ -49,7 +49,10 @@ def cells(paths: Sequence[Path]) -> dict[str, Cells]:
 
 
 def stratified(cells: Cells, missions: int, rng: np.random.Generator) -> tuple[Share, list[int]]:
-    """The share of lost missions by weight, and the number of missions of each stratum."""
+    """Draw a stratified sample. Return its weighted share of lost missions, and the draws.
+
+    The draws are the numbers of missions that were drawn from each stratum.
+    """
     names = [*cells]
     whole = sum(map(len, cells.values()))
     sizes = [len(cells[name]) / whole for name in names]
@@ -66,7 +69,7 @@ def stratified(cells: Cells, missions: int, rng: np.random.Generator) -> tuple[S
 
 
 def show(name: str, cells: Cells, missions: int, repetitions: int) -> None:
-    """Print one population, and both samples of it."""
+    """Print a population and its strata, and compare repeated samples of both kinds."""
     everyone = np.concatenate([*cells.values()])
     truth = float(everyone.mean())
     print(f"{name}: {len(everyone)} missions, {100 * truth:.1f} % lost")
@@ -99,7 +102,7 @@ def show(name: str, cells: Cells, missions: int, repetitions: int) -> None:
 
 
 def main() -> None:
-    """Draw samples of both populations."""
+    """Draw samples of both populations, and print the comparison."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("exports", nargs="*", type=Path, default=DEFAULT)
     parser.add_argument("--missions", type=int, default=200)

@@ -1,4 +1,4 @@
-"""Success rates of golden missions: 100 seeds in each world, with Wilson intervals.
+"""Measures the success rates of golden missions: 100 seeds per world, with Wilson intervals.
 
 Prints the table of docs/results/speed.md:
 
@@ -24,21 +24,24 @@ REQUIRED = {"farm": 0.99, "factory": 0.99, "sparse": 0.95, "dense": 0.85}
 
 
 def outcome_of(world: str, seed: int, given: argparse.Namespace, out: str) -> dict[str, Any]:
-    """The record of one golden mission."""
+    """Fly one golden mission, and return its record."""
     line = ["--world", world, "--seed", str(seed), "--planner", given.planner]
     line += ["--stack", given.stack, "--out", out]
     return fly(*line).result
 
 
 def row(world: str, results: list[dict[str, Any]]) -> str:
-    """One line of the table."""
+    """Return the row of the table for a world, from the records of its missions."""
     outcomes = Counter(result["outcome"] for result in results)
     wins, n = outcomes["success"], len(results)
     low, high = binomtest(wins, n).proportion_ci(method="wilson")
     flown = [r for r in results if r["outcome"] == "success"]
 
     def median(*path: str) -> float:
-        """Of one number of result.json, named by its path; NaN where no flight succeeded."""
+        """Return the median over successful flights of a number in result.json.
+
+        `path` has the keys of the number. The median is NaN if no flight succeeded.
+        """
         values = []
         for result in flown:
             value: Any = result
@@ -59,7 +62,7 @@ def row(world: str, results: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Fly and print."""
+    """Fly the missions of all selected worlds, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--first", type=int, default=1)

@@ -1,9 +1,9 @@
-r"""Towers beside the straight line from start to goal, in the worlds of the first seeds.
+r"""Counts the towers near the straight line from start to goal, in the worlds of the first seeds.
 
     python benchmarks/towers_on_way.py sparse --seeds 200 --within 2
 
-Prints how many worlds have how many towers within a horizontal distance of the line, and the seeds
-of the worlds with most.
+Prints, for each number of towers within a horizontal distance of the line, how many worlds have
+that number, and the seeds of the worlds with the most towers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ STEPS = 500  # points on the line
 
 
 def towers(world: str, seed: int, within_m: float) -> int:
-    """Count the boxes within a horizontal distance of the straight line."""
+    """Return how many boxes of a world are within a distance of the line from start to goal.
+
+    The distance is horizontal, in metres.
+    """
     scene = load_world(world, seed=seed)
     if not len(scene.boxes_enu_m):
         return 0
@@ -30,7 +33,7 @@ def towers(world: str, seed: int, within_m: float) -> int:
 
 
 def main() -> None:
-    """Count and print."""
+    """Count the towers in all worlds, and print the counts."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

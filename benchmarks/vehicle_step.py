@@ -1,4 +1,4 @@
-"""Prints what one 4 ms step of the vehicle costs, in microseconds, and where the time goes."""
+"""Measures the time of one 4 ms step of the simulated vehicle, and where that time goes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ROUNDS = 20
 
 
 def median_us(work: Callable[[], object]) -> float:
-    """Median over rounds of the mean time of one call, us."""
+    """Return the mean time of one call in a round, in microseconds: the median over rounds."""
     rounds = []
     for _ in range(ROUNDS):
         start = time.perf_counter()
@@ -28,7 +28,7 @@ def median_us(work: Callable[[], object]) -> float:
 
 
 def main() -> None:
-    """Time every shipped profile in forward flight."""
+    """Time every shipped vehicle profile in forward flight, and print the times."""
     setpoint = np.array([np.nan] * 3 + [1.0, 0.5, -0.2] + [np.nan] * 3 + [0.3, np.nan])
     for name in PROFILES.names:
         vehicle = Quadrotor(load_profile(name), position_enu_m=(0.0, 0.0, 5.0), yaw_enu_rad=0.0)

@@ -1,7 +1,7 @@
 """mavfi: what a bit flip does to a flying robot, and what it costs to survive it.
 
-`import mavfi_cli as mavfi` is the library. Its names are imported when they are first used, so that
-the import itself and `mavfi --help` stay fast. docs/how-to/python.md shows how to use them.
+The library is used as `import mavfi_cli as mavfi`. Its names are imported when they are first used,
+so that the import itself and `mavfi --help` stay fast. docs/how-to/python.md shows how to use them.
 """
 
 import importlib
@@ -54,7 +54,7 @@ _MODULES = {  # name -> module that defines it
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name of the library when it is first used."""
+    """Import a public name of the library when it is first accessed, and cache it."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(_MODULES[name]), name)
@@ -63,5 +63,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the module's names and the library's."""
+    """Return the names defined in this module and the public names, imported or not."""
     return sorted({*globals(), *__all__})

@@ -32,7 +32,9 @@ def fly(
     repeat: FaultRecord | None = None,
     **settings: Any,
 ) -> Run:
-    """Fly one mission and return its loaded run. A mission that fails is a result, not an error.
+    """Fly one mission, save its run folder in `out`, and return the run that was loaded from it.
+
+    A mission that ends in a collision, crash or other failure is a result, not an error.
 
     Args:
         config: Mission; None selects the defaults of `MissionConfig`.
@@ -44,7 +46,7 @@ def fly(
             and `detector` take their dataclasses, or mappings with the same keys.
 
     Raises:
-        ConfigError: `MissionConfig` has no such setting. The message names the nearest.
+        ConfigError: `MissionConfig` has no such setting. The message suggests the nearest name.
         ConfigError: A setting has the wrong type or is out of range.
         MavfiError: The mission could not begin, or its record could not be written.
     """
@@ -81,10 +83,10 @@ def _plain(value: Any) -> Any:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Campaign:
-    """A campaign read from its folder or from an exported file.
+    """The results of a campaign, read from its folder or from an exported file.
 
     Attributes:
-        folder: Folder of the campaign, or its exported file.
+        folder: Path of the campaign's folder, or of the exported file.
         table: One row per finished mission, in the order of the campaign's list, with the columns
             that `mavfi campaign export` writes.
     """
@@ -96,7 +98,7 @@ class Campaign:
         return f"Campaign({str(self.folder)!r}, missions={self.table.num_rows})"
 
     def _repr_html_(self) -> str | None:
-        """Return the table as HTML for a notebook; None without pandas."""
+        """Return the table as HTML for display in a notebook, or None if pandas is missing."""
         if find_spec("pandas") is None:
             return None
         html: str = self.to_pandas()._repr_html_()
@@ -112,13 +114,14 @@ class Campaign:
             import pandas  # noqa: F401  pyarrow's own error does not name the extra
         except ImportError:
             raise MavfiError(
-                "to_pandas needs pandas; install it with: pip install 'mavfi[pandas]'"
+                "to_pandas needs pandas, which is not installed; "
+                "install it with: pip install 'mavfi[pandas]'"
             ) from None
         return self.table.to_pandas()
 
 
 def campaign(what: str | Path) -> Campaign:
-    """Read a campaign, even while it runs.
+    """Read the results of a campaign. The campaign may still be running.
 
     Args:
         what: Folder or exported .parquet file of a campaign, or a preset or TOML file whose

@@ -18,12 +18,12 @@ Triple = tuple[float, ...]
 
 
 class Place(click.ParamType[Triple]):
-    """Three comma-separated numbers, such as east, north and up in m."""
+    """Option type for three comma-separated numbers, such as east, north and up in metres."""
 
     name = "x,y,z"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Triple:
-        """Return three finite numbers (3,), or fail with a usage error."""
+        """Return the three finite numbers in `value`, or fail with a usage error."""
         try:
             place = tuple(float(part) for part in str(value).split(","))
         except ValueError:
@@ -34,7 +34,7 @@ class Place(click.ParamType[Triple]):
 
 
 class _Size(click.ParamType[tuple[int, int]]):
-    """Columns and rows of an image."""
+    """Option type for the columns and rows of an image, such as 64x48."""
 
     name = "COLSxROWS"
 
@@ -85,7 +85,10 @@ world_and_vehicle = _options(
 
 
 def camera_options(prefix: str = "") -> Decorator:
-    """Return the depth camera's options. `prefix` goes before the names `size` and `rate`."""
+    """Return a decorator that adds the depth camera's options to a command.
+
+    `prefix` is put in front of the option names `size` and `rate`.
+    """
     return _options(
         click.option(
             f"--{prefix}size", "camera_size", type=_Size(), default="64x48",
@@ -120,7 +123,10 @@ signing = _options(
 
 
 def stop_on_signals() -> Callable[[], bool]:
-    """Handle SIGINT and SIGTERM. Return a function that returns True once one has arrived."""
+    """Catch SIGINT and SIGTERM instead of ending the process.
+
+    Return a function that returns True once either signal has arrived.
+    """
     received: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda signum, _frame: received.append(signum))

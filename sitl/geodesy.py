@@ -16,12 +16,18 @@ _SEA_LEVEL_PA, _LAPSE_PER_M, _EXPONENT = 101_325.0, 2.25577e-5, 5.25588
 
 
 def standard_pressure_pa(altitude_m: float) -> float:
-    """Return the air pressure, Pa, at an altitude above sea level, m; 0 above the atmosphere."""
+    """Return the standard air pressure, in Pa, at an altitude above sea level in metres.
+
+    The pressure is 0 at altitudes above the modelled atmosphere, which ends at about 44 km.
+    """
     return float(_SEA_LEVEL_PA * max(1.0 - _LAPSE_PER_M * altitude_m, 0.0) ** _EXPONENT)
 
 
 def pressure_altitude_m(pressure_pa: float) -> float:
-    """Return the altitude above sea level, m, for an air pressure, Pa; below 0 Pa counts as 0."""
+    """Return the altitude above sea level, in metres, where the standard pressure is `pressure_pa`.
+
+    A negative pressure counts as 0 Pa.
+    """
     share = max(pressure_pa, 0.0) / _SEA_LEVEL_PA
     return float((1.0 - share ** (1.0 / _EXPONENT)) / _LAPSE_PER_M)
 
@@ -39,7 +45,7 @@ class Origin:
     altitude_amsl_m: float = 489.4
 
     def geodetic(self, north_m: float, east_m: float) -> tuple[float, float]:
-        """Return latitude and longitude, degrees, of a point in the local frame."""
+        """Return the latitude and longitude, in degrees, of a point in the local frame."""
         distance = math.hypot(north_m, east_m)
         if distance < 1e-9:
             return self.latitude_deg, self.longitude_deg
@@ -54,7 +60,7 @@ class Origin:
         return math.degrees(latitude), math.degrees(longitude)
 
     def local(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
-        """Return local north and east, m, of a point given by latitude and longitude, degrees."""
+        """Return the local north and east, m, of a point given by its latitude and longitude."""
         delta = math.radians(longitude_deg - self.longitude_deg)
         sin_latitude, cos_latitude = _sine_cosine(latitude_deg)
         origin_sine, origin_cosine = _sine_cosine(self.latitude_deg)

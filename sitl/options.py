@@ -25,7 +25,11 @@ _FIRMWARE_LINKS = ("onboard=udpin:127.0.0.1:14600", *_DEFAULT_LINKS[1:])
 
 
 class _Link(click.ParamType[tuple[Preset, str]]):
-    """A preset, named or derived from PX4's port numbers, and a URL."""
+    """Option type for the URL of a link, with an optional preset of streams in front of it.
+
+    Without a preset, a URL on PX4's port for ground stations, or of a TCP server, gets the preset
+    `gcs`. All other URLs get `onboard`.
+    """
 
     name = "[PRESET=]URL"
 
@@ -42,14 +46,15 @@ class _Link(click.ParamType[tuple[Preset, str]]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleSetup:
-    """World, vehicle, camera and autopilot of a simulation.
+    """The world, vehicle, camera and autopilot to simulate.
 
     Attributes:
-        camera_size: Columns and rows.
-        depth: Unix domain socket that serves depth frames as arrays; None for no stream.
-        firmware_kind: Real firmware that flies the vehicle; None for our own autopilot.
-        firmware: Its SITL binary; None if the user starts it and has it send to `firmware_link`.
-        trusted: Ids of the MAVLink systems that may send commands; empty allows all.
+        camera_size: Columns and rows of the depth image.
+        depth: Unix domain socket that serves depth frames as arrays, or None for no such socket.
+        firmware_kind: Name of the real firmware that flies the vehicle, or None for our autopilot.
+        firmware: SITL binary of that firmware, or None if the user starts the firmware and has it
+            send to `firmware_link`.
+        trusted: Ids of the MAVLink systems that may send commands. If empty, all systems may.
     """
 
     world: str = "dense"
@@ -71,7 +76,7 @@ class VehicleSetup:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerOptions:
-    """The parsed command line."""
+    """The parsed command line of `python -m sitl`."""
 
     setup: VehicleSetup
     links: Sequence[tuple[Preset, str]]
@@ -134,9 +139,9 @@ def _sitl() -> None:
 
 
 def parse(arguments: Sequence[str]) -> ServerOptions:
-    """Parse a command line.
+    """Parse the command-line arguments of `python -m sitl`.
 
-    Raises click.UsageError if it is not valid, and click.exceptions.Exit if it requests help.
+    Raises click.UsageError if they are invalid, and click.exceptions.Exit if they request help.
     """
     given = _sitl.make_context("mavfi sitl", list(arguments)).params
     hil, backend, realtime = (given.pop(name) for name in ("hil", "json_backend", "realtime"))

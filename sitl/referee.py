@@ -41,7 +41,7 @@ class _Pose(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Collision:
-    """First collision of a flight."""
+    """The first collision of a flight, with the ground or a box."""
 
     stamp_s: float  # time of contact, between two observations
     position_enu_m: tuple[float, float, float]  # vehicle at the time of contact
@@ -50,24 +50,27 @@ class Collision:
 
     @property
     def what(self) -> str:
-        """Name of the obstacle: the ground, or a box with its index."""
+        """Name of the obstacle: `ground`, or `box` with the index of the box."""
         return "ground" if self.box_index is None else f"box {self.box_index}"
 
     @property
     def text(self) -> str:
-        """Short line for a status message."""
+        """One line for a status message, with the obstacle and the place of the collision."""
         place = " ".join(f"{c:.1f}" for c in self.position_enu_m)
         return f"Collision: {self.what} at {place}"
 
 
 class Referee:
-    """Judges one flight: finds collision, clearance and flown distance, and logs the truth.
+    """Judges one flight by the vehicle's true state, and logs that state.
+
+    The referee detects the first collision, and measures the least clearance from the boxes and
+    the flown distance.
 
     Args:
         body_box_m: Length, width and height of the vehicle's body box, centred on its position.
-        vehicle, physics: Name, mass and thrust of the vehicle, for the report.
-        pose: Source of the poses, for the report; None for the true ones.
-        logs: Keep a row of truth for every observation, for `save`.
+        vehicle, physics: Name of the vehicle, and its mass, thrust and power, for the report.
+        pose: Where the poses come from, for the report, or None if they are the true ones.
+        logs: Whether to keep a row of the log for every observation, for `log` and `save`.
     """
 
     def __init__(
@@ -111,25 +114,28 @@ class Referee:
         power_regression_w: float = 0.0,
         power_propeller_w: float = 0.0,
     ) -> Collision | None:
-        """Check the motion since the last observation, and log a row of truth.
+        """Check the motion since the last observation for a collision, and log the true state.
 
         Args:
             stamp_s: Simulated time.
             position_enu_m, velocity_enu_mps: (3,)
             quaternion_flu_enu: Unit quaternion (4,) w x y z, body forward-left-up to ENU.
-            armed, on_ground: Whether the motors may turn, and whether the physics reports contact.
-            may_land: The flight controller is landing or taking off, so a gentle ground contact is
-                not a crash. A disarmed vehicle may always land.
+            armed, on_ground: Whether the motors may turn, and whether the vehicle touches the
+                ground according to the physics.
+            may_land: Whether the flight controller is landing or taking off, so that a gentle
+                ground contact is not a crash. A disarmed vehicle may always land.
             power_regression_w, power_propeller_w: Powers for the log.
 
         Returns the first collision of the flight in the call that detects it, otherwise None.
-        Raises VehicleProcessError if the state is not finite.
+        Raises VehicleProcessError if position or attitude is not finite.
         """
         position = np.array(position_enu_m, dtype=np.float64)
         quaternion = np.array(quaternion_flu_enu, dtype=np.float64)
         velocity = np.array(velocity_enu_mps, dtype=np.float64)
         if not all(map(math.isfinite, (*position.tolist(), *quaternion.tolist()))):
-            raise VehicleProcessError(f"at {stamp_s:.3f} s the vehicle's state is not finite")
+            raise VehicleProcessError(
+                f"at {stamp_s:.3f} s the simulated vehicle's position or attitude is not finite"
+            )
         pose = _Pose(stamp_s, position, quaternion, velocity)
         before, self._last = self._last or pose, pose
         if armed:
@@ -188,7 +194,10 @@ class Referee:
         return self.collision
 
     def report(self, energies_j: Mapping[str, float] | None = None) -> dict[str, Any]:
-        """Return the result of the flight for JSON. An infinite clearance (no boxes) is None."""
+        """Return the result of the flight as a dict for JSON.
+
+        The minimum clearance is None if the world has no boxes.
+        """
         hit, least = self.collision, self.min_clearance_m
         return {
             "collision": None if hit is None else {**dataclasses.asdict(hit), "what": hit.what},
@@ -202,14 +211,14 @@ class Referee:
         }
 
     def log(self) -> dict[str, Vector]:
-        """Return the columns of the log."""
+        """Return the columns of the log, keyed by name, with one row per observation."""
         columns = zip(*self._rows, strict=True)
         return {name: np.array(column) for name, column in zip(_COLUMNS, columns, strict=True)}
 
     def save(self, folder: Path, energies_j: Mapping[str, float] | None = None) -> None:
         """Write `truth.npz` and then `truth.json` into `folder`, each atomically.
 
-        Raises RecordError if one cannot be written (no space, no permission).
+        Raises RecordError if a file cannot be written (no space, no permission).
         """
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)

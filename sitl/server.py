@@ -51,10 +51,10 @@ _MOST_TEXTS = 10  # newest texts of one client, queued for the others
 
 
 class Client(Peer):
-    """Translates the bytes of one connection into simulation calls, and messages into bytes.
+    """Passes the messages of one client to the simulation, and sends the client its messages.
 
-    Depth frames go to the clients that started the capture, and ranges to those that requested
-    them. All clients get the camera's heartbeat.
+    A client gets depth frames only after it has started the image capture, and ranges only after it
+    has requested them. All clients get the camera's heartbeat.
 
     Attributes:
         texts: Frames of received STATUSTEXTs, to be forwarded unchanged to the other clients, as
@@ -82,7 +82,7 @@ class Client(Peer):
         self.texts: deque[bytes] = deque(maxlen=_MOST_TEXTS)
 
     def rejoin(self) -> None:
-        """Reset to the preset's streams after the simulation has restarted."""
+        """Open a new link with the preset's default streams, after the simulation has restarted."""
         self.link = self._simulation.autopilot.open_link(self._preset)
 
     def close(self) -> None:
@@ -91,16 +91,16 @@ class Client(Peer):
         super().close()
 
     def receive(self, timeout_s: float) -> list[Any]:
-        """Handle the next bytes, waiting at most `timeout_s`. Return the handled messages.
+        """Wait at most `timeout_s` for bytes, and handle the messages in them.
 
-        Raises LinkLost if the peer is gone.
+        Return these messages. Raises LinkLost if the client has closed the connection.
         """
         with self._simulation.wall.sample("wait"):
             data = self.transport.receive(timeout_s)
         return self.take(data) if data else []
 
     def take(self, data: bytes) -> list[Any]:
-        """Handle received bytes. Return the handled messages."""
+        """Handle the messages in received bytes. Return these messages."""
         with self._simulation.wall.sample("link"):
             messages = self._codec.decode(data, datagram=self.transport.datagram)
             for message in messages:
@@ -114,7 +114,7 @@ class Client(Peer):
     def send_tick(self) -> bool:
         """Send all messages due at this tick at once, the autopilot's streams last.
 
-        Return False if none is due.
+        Return False if no message is due.
         """
         with self._simulation.wall.sample("link"):
             due = [
@@ -125,18 +125,24 @@ class Client(Peer):
             return self._send(due, self._simulation.autopilot.collect(self.link))
 
     def send_between(self, stamp_us: int) -> bool:
-        """Send the fast streams' messages due at a stamp, us, between ticks; False if none is."""
+        """Send the messages of the fast streams that are due at `stamp_us`, between two ticks.
+
+        Return False if no message is due.
+        """
         autopilot = self._simulation.autopilot
         if not (self.link.is_fast and isinstance(autopilot, Autopilot)):
             return False
         return self._send([], autopilot.collect_between(self.link, stamp_us))
 
     def send_answers(self) -> bool:
-        """Send answers without waiting for the next tick. Return False if there are none."""
+        """Send queued answers without waiting for the next tick. Return False if there are none."""
         return self._send([], self.link.take())
 
     def _send(self, of_camera: list[Any], of_autopilot: list[Any]) -> bool:
-        """Send messages of both components, the camera's answers first."""
+        """Send messages of camera and autopilot at once, after the camera's queued answers.
+
+        Return False if there is nothing to send.
+        """
         answers, self._camera_answers = self._camera_answers, []
         frames = [self._camera_codec.encode(message) for message in answers + of_camera]
         frames += [self._codec.encode(message) for message in of_autopilot]
@@ -167,9 +173,9 @@ _SHARE = 0.25  # share of a tick's time that clients get when the tick is overdu
 
 
 class _Pace:
-    """Computes the wait before the next tick.
+    """Schedules the ticks on the wall clock, at `speed` times real time.
 
-    Delay does not accumulate on a slow machine: anything beyond half a second is dropped.
+    On a slow machine, delay does not accumulate: the part beyond half a second is dropped.
     """
 
     def __init__(self, speed: float) -> None:
@@ -181,14 +187,14 @@ class _Pace:
         self._due_s = max(self._due_s + tick_s / self.speed, time.monotonic() - _PATIENCE_S)
 
     def remaining_s(self) -> float:
-        """Return the time until the scheduled tick, s; negative if it is overdue."""
+        """Return the seconds until the scheduled tick; the result is negative if it is overdue."""
         return self._due_s - time.monotonic()
 
 
 def _lockstep(options: ServerOptions, simulation: Simulation, stopped: Callable[[], bool]) -> None:
-    """Run until the companion closes the connection, or until stopped.
+    """Run in lockstep until the companion closes the connection or `stopped` returns True.
 
-    Raises VehicleProcessError if the companion does not answer a tick.
+    Raises VehicleProcessError if the companion does not answer a tick in time.
     """
     client = Client(simulation, open_transport(f"fd:{options.fd}"), preset=Preset.LOCKSTEP)
     pace = None if options.speed is None else _Pace(options.speed)
@@ -207,7 +213,11 @@ def _lockstep(options: ServerOptions, simulation: Simulation, stopped: Callable[
 def _await_answer(
     stamp_ms: int, client: Client, limit_s: float, stopped: Callable[[], bool]
 ) -> bool:
-    """Handle the companion's messages until it answers. Return False if stopped first."""
+    """Handle the companion's messages until it answers the tick at `stamp_ms`.
+
+    Return False if stopped first. Raises VehicleProcessError if the companion sends nothing for
+    `limit_s`.
+    """
     received_s = time.monotonic()
     while not stopped():
         messages = client.receive(_LOOK_UP_S)
@@ -235,7 +245,7 @@ class EmbeddedVehicle:
     Attributes:
         link: The companion's end of the link.
         briefing: Data that the companion gets before its first message.
-        error: The error that ended the vehicle before its companion, if any.
+        error: The error that ended the simulation before its companion, or None.
 
     Raises:
         MavfiError: The world, the vehicle, the start or the goal cannot be used.
@@ -272,7 +282,10 @@ class EmbeddedVehicle:
         return True
 
     def end(self) -> None:
-        """Simulate the last tick if the companion answered it, and close. May be repeated."""
+        """Simulate one last tick if the companion has answered the newest one, then close.
+
+        Safe to call more than once.
+        """
         if self._ended:
             return
         self._ended = True
@@ -285,7 +298,7 @@ class EmbeddedVehicle:
         self._simulation.close()
 
     def truth(self) -> FlightTruth:
-        """Return the truth recorded so far."""
+        """Return the referee's log and verdict so far, and the host's wall times and memory."""
         return self._simulation.truth()
 
 
@@ -305,7 +318,7 @@ class _Realtime:
         self._announced: Collision | None = None
 
     def run(self, stopped: Callable[[], bool]) -> None:
-        """Run until stopped, or until an inherited connection closes."""
+        """Run until `stopped` returns True or an inherited connection closes."""
         self._simulation.begin(stopped)
         if (kind := self._options.setup.firmware_kind) is not None and not stopped():
             note(f"{kind} is ready: clients may connect")
@@ -326,7 +339,7 @@ class _Realtime:
                 echo("restarted")
 
     def _between(self, stamp_us: int, *, stopped: Callable[[], bool]) -> None:
-        """Send the fast streams at a stamp within a tick, and wait for the next step."""
+        """Send the fast streams' messages due at a stamp within a tick, then serve the clients."""
         send = partial(Client.send_between, stamp_us=stamp_us)
         self._serve(send, STEP_US, stopped)
 
@@ -337,10 +350,11 @@ class _Realtime:
     def _serve(
         self, send: Callable[[Client], bool], duration_us: int, stopped: Callable[[], bool]
     ) -> None:
-        """Send due messages, then answer clients until the next tick, or once if it is overdue.
+        """Send the messages that are due, then serve the clients until the next tick or step.
 
-        The time for all clients is bounded, so that a flood of messages cannot stop the clock. Up
-        to half of it goes to sending the due messages.
+        `duration_us` is the simulated time until then. If the machine is late, the clients are
+        served once. The time for all clients is bounded, so that a flood of messages cannot stop
+        the clock. Up to half of it goes to sending the due messages.
         """
         self._pace.next_tick(duration_us * 1e-6)
         share_s = _SHARE * duration_us * 1e-6 / self._pace.speed
@@ -369,7 +383,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _serve(options: ServerOptions) -> None:
-    """Run until the peer closes or SIGINT or SIGTERM arrives; save the truth in any case."""
+    """Serve a simulation until the peer disconnects, or SIGINT or SIGTERM arrives.
+
+    If the options name a folder for the truth, it is saved there even after an error.
+    """
     stopped = stop_on_signals()
     world, profile = _loaded(options.setup)
     if not options.lockstep and not in_cache(control_step):
@@ -394,7 +411,7 @@ def _serve(options: ServerOptions) -> None:
 
 
 def warm_up() -> None:
-    """Load and compile the code that a flight runs, which is the same for every world."""
+    """Load or compile the code that a flight runs. The code is the same for every world."""
     simulation = Simulation(load_world("dense", seed=1), load_profile("solo"))
     for _ in range(2):
         simulation.advance()
@@ -455,7 +472,10 @@ def _announce(options: ServerOptions, simulation: Simulation) -> None:
 
 
 def _firmware_settings(options: ServerOptions) -> list[str]:
-    """Return lines with the settings that externally started firmware needs; none otherwise."""
+    """Return lines of text with the settings that externally started firmware needs.
+
+    The list is empty if we start the firmware ourselves, or use no firmware.
+    """
     kind = options.setup.firmware_kind
     if kind is None or options.setup.firmware is not None:
         return []
@@ -468,7 +488,10 @@ def _firmware_settings(options: ServerOptions) -> list[str]:
 
 
 def _clients_of(url: str) -> list[str]:
-    """Return one line per known client, with the option that connects it to an endpoint."""
+    """Return a line for each known client program, with the option that connects it to a URL.
+
+    The list is empty if these programs cannot connect to this kind of URL.
+    """
     at = parse_endpoint(url)
     if at.scheme not in _CALLERS:
         return []

@@ -32,15 +32,16 @@ _STEP_S = STEP_US * 1e-6
 
 
 class Simulation:
-    """One vehicle in one world; the same arguments and messages give the same flight.
+    """Simulates one vehicle in one world, with its autopilot, camera and referee.
 
-    The flight begins at the world's start, facing the goal.
+    The same arguments and messages give the same flight. It begins at the world's start, facing the
+    goal.
 
     Args:
-        camera: Its depth camera; None for one with default settings.
-        autopilot: Real firmware in place of our own autopilot; None for our own.
-        trusted: Ids of the MAVLink systems that may send commands; empty allows all.
-        logs: Keep the truth of every tick for `truth` and `save_truth`.
+        camera: The vehicle's depth camera, or None for a camera with default settings.
+        autopilot: Real firmware that flies the vehicle, or None for our own autopilot.
+        trusted: Ids of the MAVLink systems that may send commands. If empty, all systems may.
+        logs: Whether to keep the true state at every tick, for `truth` and `save_truth`.
     """
 
     awaits_setpoints = True  # in lockstep, every tick waits for the companion's setpoint
@@ -86,7 +87,7 @@ class Simulation:
         self._look()
 
     def restart(self) -> None:
-        """Begin again at the start, as after a reboot. Only the parameters survive."""
+        """Begin again at the world's start, as after a reboot. Keep only the parameter values."""
         before = self.autopilot
         self._set_up()
         assert isinstance(before, Autopilot)
@@ -102,7 +103,8 @@ class Simulation:
         """Simulate one control tick under the autopilot's command, then have the referee judge it.
 
         Args:
-            between: Called with the stamp of every physics step before the end of the tick, us.
+            between: Called after every physics step of the tick except the last, with the boot
+                clock in microseconds.
         """
         self.wall.begin_tick()
         self._fly(between)
@@ -123,13 +125,13 @@ class Simulation:
                 between(self.stamp_us + step * STEP_US)
 
     def begin(self, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Wait until the autopilot can fly, or until stopped."""
+        """Wait until the autopilot can fly, or until `stopped` returns True."""
 
     def close(self) -> None:
-        """Release everything outside this process. May be called repeatedly."""
+        """Release all resources outside this process. Safe to call more than once."""
 
     def truth(self) -> FlightTruth:
-        """Return the referee's log and verdict, and this process's wall time and peak memory."""
+        """Return the referee's log and verdict, and this process's wall times and peak memory."""
         return FlightTruth(
             log=self.referee.log(),
             report=self.referee.report(self._energies_j()),
@@ -138,7 +140,10 @@ class Simulation:
         )
 
     def save_truth(self, folder: Path) -> None:
-        """Write `truth` into a folder. Raises RecordError if a file cannot be written."""
+        """Write the referee's log and verdict, and the host's wall times and memory, to a folder.
+
+        Raises RecordError if a file cannot be written.
+        """
         self.referee.save(folder, self._energies_j())
         host = {"stage_wall_s": self.wall.totals, "memory_mb": _memory_mb()}
         write_json(folder / HOST_FILE, host)
@@ -162,7 +167,10 @@ class Simulation:
         return self.camera.poll(self.stamp_us * 1e-6, position_enu_m, quaternion_flu_enu)
 
     def _judge(self, truth: Truth, position_enu_m: Vector, quaternion_flu_enu: Vector) -> None:
-        """Have the referee judge a pose. After a collision the vehicle falls and stays down."""
+        """Have the referee judge the newest pose. After a collision, stop the motors permanently.
+
+        Raises VehicleProcessError if position or rotation is too large for a flight.
+        """
         commander, velocity = self.autopilot.commander, enu_from_ned(truth.velocity_ned_mps)
         collision = self.referee.observe(
             self.stamp_us * 1e-6, position_enu_m, quaternion_flu_enu, velocity,

@@ -30,7 +30,7 @@ _Ends = tuple[Vector, Vector, Vector, Vector]  # position, attitude; at the star
 
 @compiled
 def _point_distance(point: Vector, box: Vector) -> float:
-    """Return the distance, m, of a point (3,) to an axis-aligned box (6,); zero inside."""
+    """Return the distance, m, from a point (3,) to an axis-aligned box (6,), or 0 inside it."""
     total = 0.0
     for axis in range(3):
         gap = max(box[axis] - point[axis], point[axis] - box[axis + 3], 0.0)
@@ -40,10 +40,10 @@ def _point_distance(point: Vector, box: Vector) -> float:
 
 @compiled
 def _body_distance(centre: Vector, rotation: Vector, half: Vector, box: Vector) -> float:
-    """Return the distance, m, of an oriented box to an axis-aligned one; zero if they overlap.
+    """Return the distance, m, from an oriented box to an axis-aligned box, or 0 if they overlap.
 
     The oriented box has a centre (3,) in the world, half sides (3,), and a rotation (3, 3) from
-    body to world. The other is (6,) xmin ymin zmin xmax ymax zmax.
+    body to world. The axis-aligned box is (6,) xmin ymin zmin xmax ymax zmax.
     """
     if _overlap(centre, rotation, half, box):
         return 0.0
@@ -182,7 +182,7 @@ APPROACH_TOLERANCE_M = 1e-3  # accuracy of the nearest approach between two pose
 
 @compiled
 def _pose_at(share: float, ends: _Ends, centre: Vector, rotation: Vector) -> None:
-    """Write the pose at a fraction 0..1 of the motion: centre (3,) and rotation (3, 3)."""
+    """Write the pose at a fraction 0..1 of the motion to `centre` (3,) and `rotation` (3, 3)."""
     p0, q0, p1, q1 = ends
     for i in range(3):
         centre[i] = p0[i] + share * (p1[i] - p0[i])
@@ -207,7 +207,10 @@ def _pose_at(share: float, ends: _Ends, centre: Vector, rotation: Vector) -> Non
 def clearance(
     position: Vector, quaternion: Vector, half: Vector, boxes: Vector
 ) -> tuple[float, int]:
-    """Return the distance, m, from the body to the nearest box, and its index (-1: no box)."""
+    """Return the distance, m, from the body to the nearest box, and the index of that box.
+
+    Without boxes, the distance is infinite and the index is -1.
+    """
     centre, rotation = np.empty(3), np.empty((3, 3))
     _pose_at(0.0, (position, quaternion, position, quaternion), centre, rotation)
     reach = math.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2)
@@ -230,7 +233,7 @@ def clearance(
 def sweep(
     p0: Vector, q0: Vector, p1: Vector, q1: Vector, half: Vector, boxes: Vector, least_m: float
 ) -> tuple[float, int, float]:
-    """Compute first contact and nearest approach of the body from pose 0 to pose 1.
+    """Compute the first contact of a moving body with a box, and its nearest approach to a box.
 
     Args:
         p0, p1: Positions (3,) at the start and the end, m.
@@ -240,8 +243,8 @@ def sweep(
         least_m: Nearest approach so far, m. The search ignores larger distances.
 
     Returns:
-        Fraction of the motion at the first contact (inf: none), index of the box in contact (-1:
-        none), and nearest approach, m, at most `least_m`.
+        Fraction of the motion at the first contact (infinite without contact), index of the box in
+        contact (-1 without contact), and nearest approach, m, which is at most `least_m`.
     """
     reach = math.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2)
     dot = q0[0] * q1[0] + q0[1] * q1[1] + q0[2] * q1[2] + q0[3] * q1[3]
@@ -276,7 +279,7 @@ def _first_touch(ends: _Ends, half: Vector, box: Vector, travel: float) -> float
 
 @compiled
 def _approach(ends: _Ends, half: Vector, box: Vector, travel: float, least_m: float) -> float:
-    """Return the smallest distance during the motion, at most `least_m`."""
+    """Return the smallest distance, m, to the box during the motion, or `least_m` if smaller."""
     centre, rotation = np.empty(3), np.empty((3, 3))
     _pose_at(0.0, ends, centre, rotation)
     first_m = _body_distance(centre, rotation, half, box)

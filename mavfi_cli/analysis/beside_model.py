@@ -1,4 +1,4 @@
-"""The numbers of the performance model, compared with those of its flights."""
+"""Compares the predictions of the performance model with simulated flights (`mavfi vpm --fly`)."""
 
 from __future__ import annotations
 
@@ -37,13 +37,14 @@ NOT_SCALED = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightSetup:
-    """The parameters of a vehicle with a scheme, as needed for the comparison with the model.
+    """The flight limits and power of a vehicle with one protection scheme, such as TMR.
 
     Attributes:
+        v_max_mps, a_max_mps2: limits of velocity and acceleration in the flights.
         braking_velocity_mps: safe velocity with the deceleration that the companion assumes.
-        rotors_w: electrical hover power with all boards.
+        rotors_w: electrical hover power of the rotors when the vehicle carries all boards.
         boards_w: power of all boards.
-        cut: phrases about those of the model's values that were clipped to a mission's limits.
+        cut: one phrase for each value of the model that was clipped to what a mission allows.
     """
 
     v_max_mps: float
@@ -54,10 +55,11 @@ class FlightSetup:
     cut: tuple[str, ...] = ()
 
     def energy_j(self, flights: pa.Table) -> FloatArray:
-        """Return the electrical energy of rotors and boards in each flight, (n,); NaN if unknown.
+        """Return the electrical energy of rotors and boards in each flight, in joules.
 
-        It is the shaft energy, scaled by the ratio of the model's hover power to the simulated
-        vehicle's, plus the boards' power times the flight time. The ratio is the same for any
+        The result has the shape (n,), with NaN for flights whose energy is unknown. The energy is
+        the shaft energy, scaled by the ratio of the model's hover power to that of the simulated
+        vehicle, plus the boards' power times the flight time. The ratio does not depend on the
         number of boards.
         """
         shaft_j, hover_w, time_s = (
@@ -69,7 +71,10 @@ class FlightSetup:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelAndFlights:
-    """A number from the model and from its flights; their difference is relative to the model."""
+    """One quantity as the model predicts it and as measured in flights.
+
+    `difference_percent` is 100 * (flights / model - 1).
+    """
 
     model: float
     flights: Interval
@@ -77,20 +82,23 @@ class ModelAndFlights:
 
     @classmethod
     def of(cls, model: float, flights: Interval) -> ModelAndFlights:
-        """Compare the model's number with that of its flights."""
+        """Compare the value that the model predicts with the value measured in flights."""
         difference = 100.0 * (flights.value / model - 1.0)
         return cls(model=model, flights=flights, difference_percent=difference)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlownNumbers:
-    """Numbers from a scheme's successful flights, and from the model for the same missions.
+    """Results of the flights of one scheme, and the model's predictions for the same missions.
+
+    All measured quantities except `success` and `outcomes` are computed over successful flights.
 
     Attributes:
+        cut: as in `FlightSetup`.
         outcomes: number of flights by outcome, the most frequent first.
         errors: reasons why missions could not begin.
         path_ratio: distance flown / straight-line distance.
-        shaft_energy_j, hover_shaft_w, replans, alarms: means.
+        shaft_energy_j, hover_shaft_w, replans, alarms: mean over the flights.
     """
 
     v_max_mps: float
@@ -114,7 +122,11 @@ class FlownNumbers:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _FlownRatios:
-    """Ratios of two schemes: geometric means over the missions in which both succeeded."""
+    """Ratios between two schemes: geometric means over the missions that succeed with both.
+
+    Attributes:
+        pairs: number of these missions.
+    """
 
     pairs: int
     velocity_ratio: ModelAndFlights
@@ -124,11 +136,14 @@ class _FlownRatios:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlownScheme:
-    """The flights of a scheme.
+    """A protection scheme of one vehicle, with the results of its flights.
 
     Attributes:
+        boards: number of boards that the vehicle carries.
         problem: reason why the scheme was not flown; None if it was.
-        over_none, over_aad: ratios to the scheme `none` or `aad`; None if that was not flown.
+        flown: results of the flights; None if the scheme was not flown.
+        over_none, over_aad: ratios of this scheme to the scheme `none` or `aad`; None if that one
+            was not flown.
     """
 
     scheme: str
@@ -144,7 +159,7 @@ class FlownScheme:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlownVehicle:
-    """The flights of all schemes of a vehicle."""
+    """One vehicle, with the results of its flights under each protection scheme."""
 
     vehicle: str
     board: str
@@ -153,7 +168,15 @@ class FlownVehicle:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredOverhead:
-    """The overhead of a detector in these flights, and the paper's."""
+    """The compute overhead of a detector as measured in flights, and as the paper gives it.
+
+    Attributes:
+        flights, alarms: number of flights that were measured, and of alarms in them.
+        measured_percent: overhead relative to the compute time of the same flights.
+        checks_percent: the part of `measured_percent` that is due to checks.
+        checks_of_host_kernels_percent: time of the checks relative to that of the kernels, both
+            measured on the host.
+    """
 
     detector: str
     flights: int
@@ -165,7 +188,7 @@ class MeasuredOverhead:
 
     @classmethod
     def of(cls, overhead: ComputeOverhead) -> MeasuredOverhead:
-        """Convert an overhead to per cent, and add the paper's."""
+        """Convert the shares of a measured overhead to per cent, and add the paper's overhead."""
         return cls(
             detector=overhead.detector,
             flights=overhead.flights,
@@ -179,10 +202,13 @@ class MeasuredOverhead:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightsReport:
-    """The flights of all vehicles and schemes.
+    """The results of the flights of all vehicles and schemes.
 
     Attributes:
-        detectors: origin of the detectors' models.
+        missions_each: number of missions of each vehicle and scheme in each world.
+        detectors: where the models of the detectors come from.
+        ratios_over, paper_ratios_over: schemes that the ratios here and in the paper refer to.
+        not_scaled: one sentence for each part of the model that the simulation omits.
     """
 
     worlds: tuple[str, ...]
@@ -200,13 +226,13 @@ class FlightsReport:
 def side_by_side(
     model: ModelReport, setups: Mapping[Key, FlightSetup | str], flights: pa.Table
 ) -> tuple[FlownVehicle, ...]:
-    """Compare the flights of each vehicle and scheme with the model.
+    """Compare the flights of each vehicle and scheme with what the model predicts for them.
 
     Args:
-        model: the model's report, for the overheads that the schemes had in flight.
-        setups: setup of each vehicle and scheme, or the reason why it cannot be flown.
-        flights: as in `analysis.flights`, with the labels `group` for the vehicle and `arm` for the
-            scheme.
+        model: the model's report, computed with the overheads that the schemes had in flight.
+        setups: the setup of each vehicle and scheme, or the reason why it cannot be flown.
+        flights: a table as returned by `analysis.flights.flights`, with the labels `group` for the
+            vehicle and `arm` for the scheme.
     """
     return tuple(
         FlownVehicle(
@@ -220,17 +246,17 @@ def side_by_side(
 
 @dataclass(frozen=True, slots=True)
 class _Arm:
-    """A scheme that was flown."""
+    """A vehicle and scheme that were flown: the model's prediction, the setup and the flights."""
 
     performance: Performance
     setup: FlightSetup
-    flights: pa.Table  # all its missions
+    flights: pa.Table  # all its missions, including those that could not begin
 
     def numbers(self) -> FlownNumbers:
         ended, setup, performance = flown(self.flights), self.setup, self.performance
         won = chosen(ended, succeeded=True)
         straight_m = numbers(won, "straight_m")
-        # Mean flight time along a straight line at the model's velocity.
+        # Mean time to fly straight from start to goal at the model's velocity.
         model_s = _mean(straight_m / performance.velocity_mps).value
 
         def beside(model: float, values: FloatArray | str) -> ModelAndFlights:
@@ -258,7 +284,7 @@ class _Arm:
         )
 
     def over(self, base: _Arm) -> _FlownRatios:
-        """Compute the ratios to another scheme on the same missions."""
+        """Compute the ratios of this scheme to `base` over missions that succeed with both."""
         own, other = paired(flown(self.flights), flown(base.flights), PLACE)
         both = flags(own, "succeeded") & flags(other, "succeeded")
         own, other = (

@@ -1,11 +1,12 @@
-"""Evaluate detectors with and without faults: counts of pairs, each with its interval.
+"""Evaluate detectors on flights with and without faults.
 
-A pair holds the flights of one mission: golden, faulty, and faulty with a detector. Faults that
-were not injected or not read are counted separately; the only other number that they enter is
-`detected_inactive`. Faults in missions whose golden flight fails are counted separately too,
-because they can do no harm. All harmful faults are repeated with every detector, harmless ones only
-in `complete` missions. The effect of a fault is taken from the unprotected flight, because a
-detector may withhold the value before it is read.
+A pair holds the flights of one mission: golden, faulty, and faulty with a detector. Results are
+counts of pairs, most of them with a confidence interval. Faults that were not injected or not read
+are counted separately; the only other number that they enter is `detected_inactive`. Faults in
+missions whose golden flight fails are counted separately too, because they can do no harm. All
+harmful faults are repeated with every detector, harmless ones only in `complete` missions. The
+effect of a fault is taken from the unprotected flight, because a detector may withhold the value
+before it is read.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from mavfi_cli.stats.shares import Interval, Share, mixture, wilson
 
 NONE = "none"  # no detector: the reference for all others
 ERROR_FREE, FAULT = "error-free", "fault"  # kinds of missions
-KEY = ("world", "seed", "level", "stage", "target", "field")  # labels; golden flights: first two
+KEY = ("world", "seed", "level", "stage", "target", "field")  # golden flights have the first two
 # Columns used to form pairs, in addition to the labels: KEY, kind and detector.
 WANTED = (
     "outcome", "succeeded", "flight_time_s", "injected", "struck_s", "struck_sites", "first_bits",
@@ -79,19 +80,22 @@ Scored = Callable[[str], tuple[pa.Table, list[float]]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorFreeRow:
-    """Results of a detector on error-free flights, compared with the same flights without it.
+    """Results of a detector on a group of error-free flights, compared with those without it.
 
     Attributes:
-        by, value: label by which the flights are grouped, and its value.
-        hours: flight time with the detector, from take-over to the end of the mission.
+        by, value: label by which the flights are grouped, and its value in this group.
+        hours: total flight time with the detector, in hours from take-over to the end of each
+            mission.
         alarms, episodes: number of alarms, and of runs of consecutive alarms.
-        alarms_per_hour: its interval comes from a bootstrap over flights or, if there is no alarm,
-            from the Poisson distribution.
+        alarms_per_hour: alarms per flight hour. The interval is bootstrapped over flights or, if no
+            flight has an alarm, comes from the Poisson distribution.
         with_alarm: share of flights with at least one alarm.
         lost: share of golden successes that fail with the detector.
         gained: number of golden failures that succeed with the detector.
-        success: counts of pairs by success; the golden flight is the first.
-        lengthening: median of flight time / golden flight time - 1, where both succeed.
+        success: number of pairs by success of the golden flight (first) and of the flight with the
+            detector (second).
+        lengthening: median of flight time / golden flight time - 1, over the pairs in which both
+            flights succeed.
     """
 
     by: str
@@ -111,10 +115,11 @@ class ErrorFreeRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _WorstFlight:
-    """The largest increase of flight time, and the part that the detector recovers.
+    """The largest relative increase of flight time, and how much of it the detector recovers.
 
-    It follows the paper's section VII-A, which uses one world with one seed. Here every mission has
-    its own seed, so every successful flight is compared with its own golden flight.
+    The definition follows section VII-A of the paper, which uses one world with one seed. Here
+    every mission has its own seed, so every successful flight is compared with its own golden
+    flight.
 
     Attributes:
         faulty, protected: largest value of (flight time / golden flight time - 1), without and with
@@ -122,8 +127,8 @@ class _WorstFlight:
         recovered: `faulty` minus `protected`, each at least 0. A resample never contains a worse
             flight than the worst observed one, so the interval shows how much the value depends on
             single flights, not how bad the worst case can become.
-        recovered_share: recovered share of the increase; NaN if no unprotected flight took more
-            than LONGER times as long as its golden flight.
+        recovered_share: share of the increase `faulty` that the detector recovers; NaN if no
+            unprotected flight took more than LONGER times as long as its golden flight.
     """
 
     faulty: float
@@ -134,33 +139,41 @@ class _WorstFlight:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FaultRow:
-    """Results on flights with faults. Shares cover only active faults, except `detected_inactive`.
+    """Results of a detector on a group of flights with faults.
+
+    Shares cover only active faults, except `detected_inactive`.
 
     Attributes:
-        by, value: label by which the faults are grouped, and its value.
+        by, value: label by which the faults are grouped, and its value in this group.
         planned: number of faults, divided into `not_injected`, `not_activated` (never read),
             `golden_failed` (the mission fails even without the fault) and `active`.
-        crashed: number of faults that killed a node; this is noticed even without a detector.
-        harmful: share of faults that count as `lost` or `longer`.
+        crashed: number of faults that killed a node. This is noticed even without a detector.
+        harmful: share of faults that harm the unprotected flight: those in `lost` and `longer`.
+        lost: number of faults with which the unprotected flight does not reach the goal.
+        longer: number of faults with which it reaches the goal, but takes more than LONGER times as
+            long as its golden flight.
         flown: number of faults repeated with this detector: all harmful ones, and the harmless
             ones of complete missions.
-        not_struck: how many of these never struck because the protected flight had diverged; no
-            detection rate includes them.
+        not_struck: number of faults in `flown` that never struck because the protected flight had
+            diverged. No detection rate includes them.
         latency_s, latency_s_p95: median and 95th percentile of the time from the strike of a
             harmful fault to the alarm.
-        detected_harmful: harmful faults with an alarm at or after the strike.
+        latency_ticks, latency_ticks_p95: the same times in control ticks.
+        detected_harmful: share of harmful faults with an alarm at or after the strike.
         detected_active: the same for all faults of complete missions.
-        detected_inactive: the same for faults that struck but were not activated.
-        by_chance: faults of complete missions for which, even in the flight without the fault, the
-            detector raises an alarm at or after the time of the strike.
-        recovered: lost missions that succeed with the detector.
-        undone: harmful faults that do no harm with the detector.
-        added: harmless faults that do harm with the detector.
+        detected_inactive: the same for faults of complete missions that struck but were not
+            activated.
+        by_chance: share of the faults of complete missions for which, even in the flight without
+            the fault, the detector raises an alarm at or after the time of the strike.
+        recovered: share of lost missions that succeed with the detector.
+        undone: share of harmful faults that do no harm with the detector.
+        added: share of harmless faults that do harm with the detector.
         unprotected: success rate of all missions with an active fault, without the detector.
         protected: the same with the detector, as `share`, `low` and `high`: the rates for harmful
             and for harmless faults, weighted by the numbers of these faults.
-        success: counts of pairs in complete missions by success; the unprotected flight is first.
-        worst: worst case over the faults in `flown`.
+        success: number of pairs in complete missions by success of the unprotected flight (first)
+            and of the flight with the detector (second).
+        worst: the worst case over the faults in `flown`.
     """
 
     by: str
@@ -196,7 +209,11 @@ class FaultRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _CorrectedTest:
-    """McNemar's test of two detectors; Holm's correction covers all comparisons of its kind."""
+    """McNemar's test of two detectors on the same faults, with a corrected p-value.
+
+    Attributes:
+        corrected_p: `p_value` after Holm's correction over all comparisons of the same kind.
+    """
 
     both: int
     only_first: int
@@ -209,7 +226,12 @@ class _CorrectedTest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorComparison:
-    """A comparison of two detectors on the same harmful faults: missions recovered, harm undone."""
+    """A comparison of two detectors on the same harmful faults.
+
+    Attributes:
+        recovered: test of how many lost missions succeed with each detector.
+        undone: test of how many harmful faults do no harm with each detector.
+    """
 
     first: str
     second: str
@@ -219,19 +241,26 @@ class DetectorComparison:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorCurves(Curves):
-    """The curves of a detector; `areas` holds the area for each group of faults."""
+    """The curves of a detector over all harmful faults, and areas for groups of these faults.
+
+    Attributes:
+        areas: one entry per stage and per bit field of the faults, with the numbers `area`,
+            `area_low`, `area_high`, `average_precision` and `positives` of the group.
+    """
 
     areas: list[dict[str, str | float]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluatedPlan:
-    """The plan of an evaluation.
+    """The plan of an evaluation, as stored in `evaluation.json`.
 
     Attributes:
-        detectors: threshold and model digest of each detector, by name.
+        detectors: threshold and model digest of each detector, keyed by its name.
+        protect: stages that the detectors watch.
         places: stage, target and bit field of each kind of fault.
-        mission: common parameters of all missions that differ from the defaults.
+        mission: parameters of all missions that differ from the defaults.
+        seed: seed of the faults.
     """
 
     worlds: tuple[str, ...]
@@ -249,11 +278,12 @@ class EvaluatedPlan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evaluation:
-    """The contents of `evaluation.json`.
+    """The contents of `evaluation.json`: the plan and the results of an evaluation of detectors.
 
     Attributes:
-        error_free, faults: one row per group and detector.
-        curves: curves by detector.
+        error_free, faults: one row per group and detector, for flights without and with a fault.
+        comparisons: one entry for every two detectors.
+        curves: the curves of each detector, keyed by its name.
         errors: labels and reason of each mission that could not begin.
     """
 
@@ -273,11 +303,13 @@ class Evaluation:
 def pairs_of(
     flights: Iterable[pa.Table], detectors: Collection[str], complete: Callable[[int], bool]
 ) -> tuple[pa.Table, pa.Table]:
-    """Match flights into pairs; return the pairs without a fault, and those with one.
+    """Match flights into pairs, and return those without a fault and those with one as two tables.
 
     Args:
         flights: ended flights with labels for kind, detector and KEY, in the order of the pairs.
-        complete: whether all faults of the mission with this seed are repeated with detectors.
+        detectors: detectors of the pairs to return.
+        complete: returns whether all faults of the mission with a given seed are repeated with
+            detectors.
 
     Returns:
         Two tables with the columns of SCHEMA. `active`: the unprotected flight was struck, and a
@@ -340,7 +372,10 @@ def pairs_of(
 
 
 def _rows_of(table: pa.Table) -> Iterator[dict[str, Any]]:
-    """Yield flights as rows of _FLOWN, with the time and stage of each alarm in `all_alarms`."""
+    """Yield each flight as a row with the columns of _FLOWN.
+
+    The additional entry `all_alarms` lists the time and stage of each alarm.
+    """
     labels = [name for name in ("kind", "detector", *KEY) if f"label_{name}" in table.column_names]
     for row in table.select([*(f"label_{name}" for name in labels), *WANTED]).to_pylist():
         yield {
@@ -359,14 +394,18 @@ def _rows_of(table: pa.Table) -> Iterator[dict[str, Any]]:
 def _first_alarm(
     alarms: Iterable[tuple[float, str]], from_s: float | None
 ) -> tuple[float, str] | None:
-    """Return the first alarm at or after `from_s`; None if there is none."""
+    """Return the first alarm at or after `from_s`, or None if there is none or `from_s` is None."""
     if from_s is None:
         return None
     return next((alarm for alarm in alarms if alarm[0] >= from_s - 1e-9), None)
 
 
 def _against(golden: pa.Table, flown: pa.Table) -> dict[str, Any]:
-    """Compare flights with their golden flights row by row; return `harm` and related columns."""
+    """Return columns that compare each flight in `flown` with the same row of `golden`.
+
+    They are the columns of SCHEMA that `flown` has, those about the golden flight, `lengthening`
+    and `harm`.
+    """
     lost = pc.invert(flown["won"])
     over, harmed = against_golden(pc.invert(golden["won"]), golden["time_s"], lost, flown["time_s"])
     harm = pc.if_else(harmed, pc.if_else(lost, LOST, LATE), HARMLESS)
@@ -382,7 +421,7 @@ def _against(golden: pa.Table, flown: pa.Table) -> dict[str, Any]:
 
 
 def _table_of(columns: dict[str, Any], rows: int) -> pa.Table:
-    """Return a table with SCHEMA; columns that are missing or None are empty."""
+    """Return a table with the schema SCHEMA. Columns that are missing or None hold only nulls."""
     arrays = []
     for field in SCHEMA:
         values = columns.get(field.name)
@@ -409,13 +448,13 @@ def results(
     scored: Scored,
     **about: Any,
 ) -> Evaluation:
-    """Compute the results of the pairs.
+    """Compute the results of all detectors from the pairs of flights.
 
     Args:
-        detectors: all of them, `none` first.
-        error_free, faults: as `pairs_of` returns them.
-        scored: returns a detector's harmful faults with the columns `stage`, `field` and `score`,
-            and its scores of the error-free flights.
+        detectors: names of all detectors, `none` first.
+        error_free, faults: the tables of pairs that `pairs_of` returns.
+        scored: takes the name of a detector. Returns its harmful faults, with the columns `stage`,
+            `field` and `score`, and its scores of the error-free flights.
         about: the other fields of the evaluation.
     """
     return Evaluation(
@@ -436,7 +475,10 @@ def results(
 def _grouped(
     detectors: Sequence[str], pairs: pa.Table, groups: Sequence[str]
 ) -> Iterator[tuple[str, str, str, pa.Table]]:
-    """Yield group, value, detector and pairs, in the order in which the values first occur."""
+    """Yield, for each group of pairs, the label, its value, the detector and the table of pairs.
+
+    The values of a label come in the order in which they first occur.
+    """
     for by in groups:
         values = pc.unique(pairs[by]).to_pylist() if by != ALL else [ALL] * bool(pairs.num_rows)
         for value, detector in itertools.product(values, detectors):
@@ -448,7 +490,7 @@ def _part(pairs: pa.Table, by: str, value: str, detector: str) -> pa.Table:
 
 
 def _comparisons(detectors: Sequence[str], faults: pa.Table) -> list[DetectorComparison]:
-    """Compare every two detectors on the same faults, correcting p-values over all comparisons."""
+    """Compare every two detectors on the same faults, with p-values corrected by Holm."""
     names = [*itertools.combinations(detectors, 2)]
     tests = [_recoveries(*(chosen(faults, detector=name) for name in two)) for two in names]
     recovered, undone = (
@@ -465,7 +507,10 @@ def _comparisons(detectors: Sequence[str], faults: pa.Table) -> list[DetectorCom
 
 
 def _recoveries(first: pa.Table, second: pa.Table) -> tuple[McNemar, McNemar]:
-    """Test two detectors on the same harmful faults: lost missions recovered, and harm undone."""
+    """Test which of two detectors recovers more lost missions, and which undoes more harm.
+
+    Both tests use the same harmful faults for both detectors.
+    """
     here, there = paired(chosen(first, harm=(LOST, LATE)), second, KEY)
     lost = pc.equal(here["harm"], LOST)
     return (
@@ -507,7 +552,7 @@ def _error_free_row(by: str, value: str, detector: str, pairs: pa.Table) -> Erro
 
 
 def _rate_per_hour(alarms: FloatArray, hours: FloatArray) -> Interval:
-    """Return alarms per flight hour, leaving out missions that were cut off without flight time."""
+    """Return the alarms per flight hour. Missions that were cut off without a time are omitted."""
     alarms, hours = alarms[hours > 0.0], hours[hours > 0.0]
     total = float(hours.sum())
     if total > 0.0 and not alarms.any():
@@ -520,7 +565,12 @@ def _rate_per_hour(alarms: FloatArray, hours: FloatArray) -> Interval:
 
 
 def _fault_row(by: str, value: str, detector: str, bare: pa.Table, pairs: pa.Table) -> FaultRow:
-    """Return the row of a group: `bare` has its pairs without a detector, `pairs` those with it."""
+    """Compute the results of a detector on a group of faults.
+
+    Args:
+        bare: pairs of the group without a detector.
+        pairs: pairs of the group with the detector.
+    """
     injected = bare.filter(pc.not_equal(bare["injected"], Injected.NOT_INJECTED.value))
     active, judged = chosen(injected, active=True), chosen(injected, judged=True)
     counts = {harm: chosen(judged, harm=harm).num_rows for harm in (HARMLESS, LOST, LATE)}
@@ -587,7 +637,11 @@ def _worst(pairs: pa.Table) -> _WorstFlight:
     faulty, protected = faulty[usable], protected[usable]
 
     def recovered(rows: IntArray) -> FloatArray:
-        """Return the reduction of the worst increase, (k,), for resamples of missions (k, n)."""
+        """Return how much the detector reduces the largest increase, for each of k resamples.
+
+        `rows` has the shape (k, n) and holds the indices of the missions in each resample. The
+        result has the shape (k,).
+        """
         # A resample in which all flights of a kind failed counts as having no increase.
         worst = [np.maximum(times[rows].max(axis=-1), 0.0) for times in (faulty, protected)]
         return np.asarray(worst[0] - worst[1])

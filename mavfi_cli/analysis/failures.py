@@ -1,7 +1,8 @@
 """Mission failures caused by faults: per fault, per SDC of a kernel, and per flight hour.
 
 Every injected fault counts if the golden flight of its mission succeeds, even if nothing read the
-struck value. `mavfi kernels` counts such a flip as a benign run, so both count the same population.
+corrupted value. `mavfi kernels` counts such a flip as a benign run, so both count the same
+population.
 
 The flights of a user's companion are not repeatable. For these, every injected fault counts, and
 the failures of all golden flights are given for comparison.
@@ -28,18 +29,22 @@ _STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SettingFailures:
-    """Missions of a setting that fail because of its faults.
+    """How often the faults of one setting of a campaign make the mission fail.
 
     Attributes:
-        name: phrase for the setting.
-        failure: share of injected faults whose mission fails; only missions whose golden flight
-            succeeds count, unless flights are not repeatable.
-        golden: share of golden flights that fail, if flights are not repeatable; None for pairs.
-        kernel: the kernel that all its faults strike at instruction level; None if there is no
-            such kernel, or without a summary of isolated kernels.
-        layers: comparison with the SDCs of the isolated kernel; None without runs of that kernel.
-        per_hour: failures per flight hour with the ends of the interval; None unless requested.
-            If flights are not repeatable, only failures in excess of those of golden flights.
+        name: the labels of the setting in one phrase.
+        failure: share of injected faults whose mission fails. If flights are repeatable, only
+            missions whose golden flight succeeds count.
+        golden: share of golden flights that fail; None if flights are repeatable, because then
+            each flight is paired with its own golden flight.
+        kernel: the kernel that all faults of the setting strike at instruction level; None if
+            there is no such kernel, if no summary of isolated kernels was given, or if flights are
+            not repeatable.
+        layers: comparison with the SDCs of the isolated kernel; None if the summary has no runs of
+            that kernel.
+        per_hour: failures per flight hour, and the ends of the confidence interval; None unless
+            requested. If flights are not repeatable, only the failures in excess of those of golden
+            flights count.
     """
 
     labels: Labels
@@ -58,16 +63,19 @@ def setting_failures(
     upsets_per_hour: float | None = None,
     confidence: float = 0.95,
 ) -> list[SettingFailures]:
-    """Compute the failures of every setting with faults that has golden flights.
+    """Compute how often faults make missions fail, for each setting that has golden flights.
+
+    Settings without a fault are omitted.
 
     Args:
-        kernels: folder with a summary of isolated kernels; None leaves out `layers`.
-        upsets_per_hour: bit flips that reach the injection sites per flight hour.
+        kernels: folder written by `mavfi kernels`; None leaves out `kernel` and `layers`.
+        upsets_per_hour: number of bit flips per flight hour that reach the injection sites; None
+            leaves out `per_hour`.
 
     Raises:
-        RecordError: the folder does not exist or cannot be read.
-        ConfigError: `kernels` is given, and its faults differ from the campaign's or the sample is
-            stratified; or the rate is negative.
+        RecordError: the summary in `kernels` does not exist or cannot be read.
+        ConfigError: `kernels` is given, and its faults were drawn in another way than those of the
+            campaign, or the sample is stratified; or `upsets_per_hour` is negative.
     """
     alone = None if kernels is None else KernelSummary.read(kernels / KERNELS)
     silent = {own.name: own.outcomes["sdc"] for own in alone.kernels} if alone else {}
@@ -110,7 +118,7 @@ def setting_failures(
 def _unpaired(
     groups: Sequence[Group], upsets_per_hour: float | None, confidence: float
 ) -> Iterator[SettingFailures]:
-    """Yield the failures of the settings with faults whose flights are not repeatable."""
+    """Yield the failures of each setting that has faults and flights that are not repeatable."""
     for group in groups:
         golden, places = group.golden_among(groups), group.among("injected", _STRUCK)
         if golden is None or not places.any():
@@ -132,7 +140,11 @@ def _unpaired(
 
 
 def _kernel(configs: Sequence[MissionConfig]) -> str | None:
-    """Return the name in `mavfi kernels` of the only kernel that these missions attack, or None."""
+    """Return the name of the only kernel that these missions attack, or None if there are several.
+
+    The name is that in `mavfi kernels`. None is also returned if there are no missions, or if one
+    of them has no instruction-level fault.
+    """
     faults = [config.instruction for config in configs]
     if not faults or any(fault is None for fault in faults):
         return None
@@ -153,7 +165,7 @@ def _require_same_faults(config: MissionConfig, alone: KernelSummary) -> None:
     ours = {"rule": drawn.rule.value, "compat": fault.compat, "model": drawn.model.to_json()}
     if ours != alone.faults:
         raise ConfigError(
-            f"its faults must be drawn as in the campaign, by {canonical(ours)}, "
-            f"but were drawn by {canonical(alone.faults)}",
+            "its faults must be drawn by the same rules as those of the campaign, "
+            f"{canonical(ours)}, but were drawn by {canonical(alone.faults)}",
             path=alone.path,
         )

@@ -1,7 +1,7 @@
 """A campaign as one table: one row per finished mission, in the order of the mission list.
 
-Configurations come from the mission list, results from the records. The table is a
-`pyarrow.Table`; `to_pandas()` turns it into a data frame.
+The configurations come from the mission list, the results from the records. The table is a
+`pyarrow.Table`; its method `to_pandas()` turns it into a data frame.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ EXPORTED = (
     "wall_s", "alarm_count", *COSTS, "attempts", "path", STRATUM, WEIGHT, "changes",
 )  # fmt: skip
 BITS = pa.list_(pa.list_(pa.int64()))  # a list of bits for each struck component
-_TYPES = {  # types of the columns that are not text, in case they hold no value
+_TYPES = {  # types of the columns that are not text, for tables in which they hold no value
     "struck_bits": BITS,
     **dict.fromkeys(
         ("number", "seed", "world_seed", "fault_seed", "fault_bits", "strikes", "strike_invocation",
@@ -76,17 +76,18 @@ IntArray = NDArray[np.int64]
 
 
 def flights(ledger: Ledger, among: Sequence[int] | None = None) -> pa.Table:
-    """Return the finished missions. Missions that could not begin have the state `error`.
+    """Return a table with one row per finished mission, in the order of the mission list.
 
-    The columns are the measures of `mission.measures`, the requested values of CONFIG, those of the
-    fault's FAULT as `fault_NAME`, each label as `label_NAME`, and all labels as text in `labels`.
-    `succeeded` means that the mission reached its goal. `counted` means that it is golden, or that
-    its fault struck something that was read or caught. `check_share` and `recovery_share_STAGE` are
-    the shares of the flight time that detection and recovery take. `weight` is the number of
-    uniformly drawn missions that a mission of a `stratum` stands for.
+    Missions that could not begin have the state `error`. The columns are the measures of
+    `mission.measures`, the requested values of CONFIG, the fields FAULT of the fault as
+    `fault_NAME`, each label as `label_NAME`, and all labels as text in `labels`. `succeeded` means
+    that the mission reached its goal. `counted` means that the mission is golden, or that its fault
+    struck, unless the struck value expired before anything read it. `check_share` and
+    `recovery_share_STAGE` are the shares of the flight time that detection and recovery take.
+    `weight` is the number of uniformly drawn missions that a mission of a `stratum` stands for.
 
     Args:
-        among: numbers of the missions to choose from; None means all.
+        among: numbers of the missions to include; None includes all.
     """
     if ledger.export is not None:
         table = _updated(ledger.export, ledger.folder)
@@ -142,7 +143,10 @@ def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
 
 
 def _column(values: Sequence[Any]) -> pa.Array:
-    """Return a column of one type; labels of mixed types become text."""
+    """Convert the values to a column of one type. Integers mixed with floats become floats.
+
+    Any other mixture of types becomes text.
+    """
     kinds = {type(value) for value in values if value is not None}
     if len(kinds) > 1 and kinds != {int, float}:
         values = [None if value is None else str(value) for value in values]
@@ -150,12 +154,18 @@ def _column(values: Sequence[Any]) -> pa.Array:
 
 
 def untreated(labels: Labels) -> str:
-    """Return, as text, the labels common to protected and unprotected flights with equal faults."""
+    """Return the labels without those in TREATMENT, as canonical text.
+
+    Protected and unprotected flights with the same fault have the same text.
+    """
     return canonical({name: value for name, value in labels.items() if name not in TREATMENT})
 
 
 def chosen(table: pa.Table, **values: Any) -> pa.Table:
-    """Return rows with these values. None matches empty cells; a tuple matches any of its items."""
+    """Return the rows whose columns have the given values.
+
+    None matches a null, and a tuple matches any of its items.
+    """
     for name, value in values.items():
         allowed = value if isinstance(value, tuple) else (value,)
         equal = (
@@ -166,24 +176,28 @@ def chosen(table: pa.Table, **values: Any) -> pa.Table:
 
 
 def flown(table: pa.Table) -> pa.Table:
-    """Return the rows of missions that have an outcome, without those that could not begin."""
+    """Return the rows of the missions that were flown, without those that could not begin."""
     return table.filter(pc.equal(table["state"], ResultState.FLOWN.value))
 
 
 def errors(table: pa.Table, phrase: str) -> list[str]:
-    """Format `phrase` with number, labels and reason of every mission that could not begin."""
+    """Return one text for each mission that could not begin, made by formatting `phrase`.
+
+    Args:
+        phrase: format string that may contain `{number}`, `{labels}` and `{reason}`.
+    """
     rows = table.select(["number", "labels", "state", "reason"]).to_pylist()
     return [phrase.format_map(row) for row in rows if row["state"] == ResultState.ERROR.value]
 
 
 def numbers(table: pa.Table, name: str) -> FloatArray:
-    """Return a column as floats, (n,); NaN for empty cells."""
+    """Return a column as an array of floats of shape (n,), with NaN for nulls."""
     column = table[name].cast(pa.float64())
     return np.asarray(column.fill_null(math.nan).to_numpy(), dtype=np.float64)
 
 
 def flags(table: pa.Table, name: str) -> BoolArray:
-    """Return a boolean column, (n,)."""
+    """Return a column as a boolean array of shape (n,), with False for nulls."""
     return np.asarray(table[name].to_numpy(zero_copy_only=False), dtype=bool)
 
 
@@ -193,9 +207,10 @@ def known(values: FloatArray) -> FloatArray:
 
 
 def exported(ledger: Ledger) -> pa.Table:
-    """Return one row per finished mission, in the order of the list, with the labels as columns.
+    """Return the table that `mavfi campaign export` writes, with one row per finished mission.
 
-    The table's metadata contain its provenance.
+    The rows are in the order of the mission list. The columns are EXPORTED and one per label. The
+    metadata of the table contain the provenance of the campaign.
     """
     whole = flights(ledger)
     if ledger.export is not None:
@@ -206,7 +221,9 @@ def exported(ledger: Ledger) -> pa.Table:
 
 
 def read_export(path: Path) -> pa.Table:
-    """Read an exported campaign. Columns of earlier versions are converted to the current types.
+    """Read the table of a campaign from its exported .parquet file.
+
+    Columns written by earlier versions are converted to the current types.
 
     Raises:
         RecordError: the file is missing or damaged.
@@ -234,7 +251,7 @@ def _parsed(text: str | None) -> list[list[int]] | None:
 
 
 def _typed(table: pa.Table) -> pa.Table:
-    """Give columns without values the types that they would have with values."""
+    """Cast columns that hold only nulls to the types that they have when they hold values."""
     kinds = {
         field.name: _TYPES.get(field.name, pa.string())
         for field in table.schema
@@ -249,12 +266,13 @@ def _typed(table: pa.Table) -> pa.Table:
 
 
 def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
-    """Return the provenance of a campaign, from its ledger or from an export; {} if unknown.
+    """Return the provenance of a campaign, from its ledger or from its exported table.
 
     Returns:
-        `name` of the campaign; `planned`, the number of missions on its list; `sampling`, how its
-        faults were drawn; `settling`, how claims were settled; `versions` of the programs;
-        and `host`, with the `machine`, `cores` and `started` of the first record.
+        A dictionary with the `name` of the campaign; `planned`, the number of missions on its list;
+        `sampling`, how its faults were drawn; `settling`, how claims were settled; the `versions`
+        of the programs; and `host`, with the `machine`, `cores` and `started` of the first record.
+        The dictionary is empty if an exported table has no provenance.
     """
     table = source if isinstance(source, pa.Table) else source.export
     if table is not None:
@@ -279,15 +297,17 @@ def changed(
     ratio: bool = True,
     resamples: int = RESAMPLES,
 ) -> Interval:
-    """Return the geometric mean of second / first, with an interval from the logarithms.
+    """Return the geometric mean of `second` / `first`, with its bootstrap confidence interval.
 
-    Pairs with a value that is not positive are left out. Several pairs of one mission are not
-    independent, so their mean counts as one value.
+    The interval is computed from the logarithms of the ratios. Pairs with a value that is not
+    positive are omitted. Several pairs of one mission are not independent, so their mean counts as
+    one value.
 
     Args:
-        missions: key that dependent pairs share, (n,).
-        first, second: values of each pair, (n,).
-        ratio: False averages second - first instead, for values that may be zero.
+        missions: the mission of each of the n pairs, or another key that dependent pairs share.
+        first, second: the two values of each pair.
+        ratio: if False, return the arithmetic mean of `second` - `first` instead, for values that
+            may be zero. Then only pairs with NaN are omitted.
     """
     changes: dict[Hashable, list[float]] = {}
     for mission, a, b in zip(missions, first, second, strict=True):
@@ -307,7 +327,7 @@ _COMPARED = frozenset(measures_of(FlightRecord())) | {"outcome"}
 
 
 def mission_of(ledger: Ledger, number: int) -> tuple[MissionConfig, Mapping[str, Any]]:
-    """Return a mission's configuration and its row of `flights`.
+    """Return the configuration of a mission, and its row in the table that `flights` returns.
 
     Raises:
         RecordError: the campaign cannot be read.
@@ -317,7 +337,7 @@ def mission_of(ledger: Ledger, number: int) -> tuple[MissionConfig, Mapping[str,
         if row["outcome"] is not None:
             (config,) = ledger.configs([number])
             return config, row
-    problem = f"has no flown mission {number}; the list has {number_span(ledger)}"
+    problem = f"mission {number} has not been flown; the list has {number_span(ledger)}"
     raise ConfigError(problem, path=ledger.folder)
 
 
@@ -328,9 +348,14 @@ def number_span(ledger: Ledger) -> str:
 
 
 def differing(row: Mapping[str, Any], flight: FlightRecord) -> list[str]:
-    """Return the columns in which a repeated flight differs from its row.
+    """Return the names of the columns in which a repeated flight differs from the recorded row.
 
-    Values with equal texts count as equal, because exports store mixed columns as text.
+    Only the outcome and the measures are compared. Values with equal texts count as equal, because
+    exports store columns of mixed types as text.
+
+    Args:
+        row: row of the first flight in the table that `flights` returns.
+        flight: record of the repeated flight.
     """
     again = {**measures_of(flight), "outcome": flight.outcome}
     return [

@@ -20,12 +20,13 @@ OUTCOMES = ("benign", "sdc", "crash", "hang")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IsolatedKernel:
-    """The runs of an isolated kernel, with one fault each.
+    """The outcomes of fault injection into one isolated kernel. Each run has one fault.
 
     Attributes:
         name, title: the kernel's name, and its name in tables.
-        outcomes: the share of each of OUTCOMES. Its interval is wider than that of independent
-            runs, because runs on one input are correlated.
+        runs: number of runs.
+        outcomes: the share of runs with each of the OUTCOMES. Its interval is wider than that of
+            independent runs, because runs on the same input are correlated.
     """
 
     name: str
@@ -36,11 +37,11 @@ class IsolatedKernel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelSummary:
-    """A summary of attacked kernels.
+    """The contents of `kernels.json`: the outcomes of fault injection into isolated kernels.
 
     Attributes:
         faults: how the faults were drawn: `rule`, `compat` and `model`.
-        seed: seed of the faults.
+        seed: seed from which the faults were drawn.
         flight: the flight from which the kernels' inputs were taken.
     """
 
@@ -52,12 +53,16 @@ class KernelSummary:
 
     @property
     def runs(self) -> int:
-        """Number of runs of all kernels."""
+        """Total number of runs, over all kernels."""
         return sum(kernel.runs for kernel in self.kernels)
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read a summary. Raise RecordError if the file is missing or is not a summary."""
+        """Read the summary in the file at `path`.
+
+        Raises:
+            RecordError: the file is missing, or is not a summary written by `mavfi kernels`.
+        """
         try:
             data = json.loads(read_bounded(path, _LARGEST))
             plan = data["plan"]
@@ -78,7 +83,9 @@ class KernelSummary:
             )
         except (ValueError, LookupError, TypeError, AttributeError) as error:
             lack = lack_of(error)
-            raise RecordError(f"{path}: not a summary of `mavfi kernels` ({lack})") from None
+            raise RecordError(
+                f"{path}: not a summary written by `mavfi kernels` ({lack})"
+            ) from None
 
 
 def _share(entry: Any) -> Share:

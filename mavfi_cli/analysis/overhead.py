@@ -2,8 +2,8 @@
 
 Relative to flight time, each number of a setting is the mean over the missions that count for the
 success rate, with its bootstrap interval. Relative to kernel time, each number covers all
-error-free flights of a detector. Kernels and recomputations have the latencies of the flight's
-platform. Checks have the times measured on the host.
+error-free flights of a detector. Kernels and recomputations take the latencies of the flight's
+platform. Checks take the time that was measured on the host.
 """
 
 from __future__ import annotations
@@ -41,18 +41,21 @@ _LEDGERS = (LEDGER, f"protected/*/{LEDGER}", f"flights/{LEDGER}")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightOverhead:
-    """The overhead of a detector in a setting. Shares are relative to flight time: 0.01 is 1 %.
+    """The overhead of one detector, averaged over the flights of one setting of a campaign.
+
+    Shares are relative to flight time: 0.01 is 1 %.
 
     Attributes:
         labels: labels of the setting, including the detector.
-        flights: number of flights with checks.
+        flights: number of flights in which the detector checked messages.
         checks_per_s: checks per second of flight.
         check_host_s: mean time of a check on the host of the flight.
         detection_host_share: time of all checks on that host, divided by the flight time.
-        recomputations: number in all flights, by stage.
+        recomputations: number of recomputations in all flights, by stage.
         recovery_share: simulated latency of recomputations, divided by the flight time, by stage.
         recovery_share_in_all: sum of `recovery_share` over the stages.
-        share_in_all: detection plus recovery; adds host time and simulated time, as the paper does.
+        share_in_all: share of detection plus recovery. It adds host time and simulated time, as the
+            paper does.
     """
 
     labels: Labels
@@ -72,7 +75,12 @@ class FlightOverhead:
         weighted: Sequence[tuple[DetectionCost, float]],
         confidence: float,
     ) -> Self:
-        """Average the costs of one detector over its weighted flights; at least one is required."""
+        """Average the costs of one detector over its flights.
+
+        Args:
+            labels: labels of the setting.
+            weighted: cost and weight of each flight; at least one is required.
+        """
         costs = [cost for cost, _ in weighted]
         weights = np.array([weight for _, weight in weighted])
 
@@ -105,10 +113,12 @@ class FlightOverhead:
 def flight_overheads(
     ledger: Ledger, groups: Sequence[Group], confidence: float = 0.95
 ) -> list[FlightOverhead]:
-    """Compute the overheads of every setting with a detector, one row per setting and detector.
+    """Compute the overhead of each detector in each of the settings.
+
+    The result has one row per setting and detector. Settings without a detector are omitted.
 
     Raises:
-        RecordError: the campaign was opened from an export, which has no records of flights.
+        RecordError: the campaign was opened from an export, which contains no records of flights.
     """
     rows = []
     for group in groups:
@@ -126,12 +136,12 @@ def flight_overheads(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComputeOverhead:
-    """The compute overhead of a detector, summed over flights.
+    """The compute overhead of a detector: times and counts, summed over its flights.
 
     Attributes:
         detection_s: host time of all checks of the gate.
-        recompute_s: simulated time of recomputations, each at the mean latency of its stage's
-            kernels.
+        recompute_s: simulated time of recomputations. Each one takes the mean latency of the
+            kernels of its stage.
         compute_s: simulated time of all kernels, including recomputations.
         host_compute_s: host time of all kernels.
         alarms: number of alarms that led to a recomputation.
@@ -156,19 +166,19 @@ class ComputeOverhead:
 
     @property
     def checks_share(self) -> float:
-        """The part of `share` due to checks; the rest is due to recomputation."""
+        """The part of `share` that is due to checks. The rest is due to recomputations."""
         return self.detection_s / (self.compute_s - self.recompute_s)
 
     @property
     def checks_host_share(self) -> float:
-        """Time of checks over time of kernels, both measured on the host."""
+        """The time of all checks divided by that of all kernels, both measured on the host."""
         return self.detection_s / self.host_compute_s
 
     @classmethod
     def of(
         cls, records: Iterable[FlightRecord], platform: str | None = None
     ) -> dict[str, ComputeOverhead]:
-        """Compute the overhead of every detector in these records, summed over its flights.
+        """Compute the overhead of each detector in these flights, keyed by the detector's name.
 
         Flights with a fault are ignored, because the fault may cause their alarms.
 
@@ -202,7 +212,11 @@ class ComputeOverhead:
         }
 
     def describe(self, where: str) -> str:
-        """Describe the overhead: its flights, where they are, their platforms, and its parts."""
+        """Describe in one phrase where the overhead was measured, and its parts in per cent.
+
+        Args:
+            where: name of the place in which the flights are recorded, such as a folder.
+        """
         again = self.share - self.checks_share
         left = f" ({self.left_out} on other platforms left out)" if self.left_out else ""
         return (
@@ -215,7 +229,10 @@ class ComputeOverhead:
 
 
 def _platform_name(called: str) -> str:
-    """Return the recorded name; for a file, the name in it, or its stem if it cannot be loaded."""
+    """Return the name of a platform that a record gives by name or by the path of its file.
+
+    For a path, this is the name in the file, or the file's stem if the file cannot be loaded.
+    """
     if not called.endswith(".toml"):
         return called
     try:
@@ -225,7 +242,7 @@ def _platform_name(called: str) -> str:
 
 
 def _same(name: str, platform: str) -> bool:
-    """Return whether `name` is the platform, or its variant with a latency factor near 1."""
+    """Return True if `name` is the platform, or a variant of it with a latency factor near 1."""
     base, times, factor = name.rpartition(TIMES)
     if name == platform or not times or base != platform:
         return name == platform
@@ -238,14 +255,17 @@ def _same(name: str, platform: str) -> bool:
 def recorded_overheads(
     path: Path, detectors: Sequence[str], platform: str | None = None
 ) -> dict[str, ComputeOverhead]:
-    """Return the overheads of detectors in the error-free flights at a path.
+    """Return the overhead of each detector in the error-free flights at `path`, keyed by its name.
 
     Args:
-        path: a run folder, a folder of them, a campaign, or the folder of another command.
+        path: a run folder, a folder of run folders, the folder of a campaign, or the output folder
+            of a command that flies missions.
+        detectors: names of the detectors; those that did not fly are omitted from the result.
         platform: use only flights on this platform; None uses all.
 
     Raises:
-        RecordError: no such flight is recorded; the message lists the recorded ones.
+        RecordError: no error-free flight with one of the detectors is recorded on the platform. The
+            message lists the detectors and platforms that are recorded.
     """
     recorded = ComputeOverhead.of(_records(path), platform)
     known = {name: overhead for name, overhead in recorded.items() if name in detectors}
@@ -265,7 +285,7 @@ def recorded_overheads(
 
 
 def _records(path: Path) -> Iterator[FlightRecord]:
-    """Yield the records of a run folder, of all runs in a folder, or of a campaign's missions."""
+    """Yield the flight records at `path`: of one run, of a folder of runs, or of campaigns."""
     if path.is_file() or (path / RESULT).is_file():
         yield load_run(path).record
         return

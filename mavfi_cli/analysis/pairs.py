@@ -64,7 +64,7 @@ _NO, _YES = pa.scalar(False), pa.scalar(True)  # noqa: FBT003
 
 
 class Fate(Enum):
-    """The effect of a fault on the node that it strikes."""
+    """A class of faults, by their effect on the node that they strike."""
 
     ALL = "all faults"
     SILENT = "silent"  # the node continues, with or without a wrong value
@@ -73,13 +73,13 @@ class Fate(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Balance:
-    """The harm that a detector undoes and the harm that it causes, on the same faults.
+    """How many missions a detector saves from harm, and how many it harms, for the same faults.
 
     Attributes:
-        pairs: faults with flights both without and with the detector.
-        before: harmed missions without the detector.
-        undone: missions that are harmed only without it.
-        caused: missions that are harmed only with it.
+        pairs: number of faults that were flown both without and with the detector.
+        before: number of missions that are harmed without the detector.
+        undone: number of missions that are harmed only without the detector.
+        caused: number of missions that are harmed only with the detector.
         p_value: p-value of McNemar's exact test.
     """
 
@@ -92,28 +92,30 @@ class Balance:
 
 @dataclass(frozen=True, slots=True)
 class Flights:
-    """Flown missions, one per row, with the columns that items, claims and comparisons read.
+    """A table of flown missions, one per row, each compared with its golden flight.
 
-    A column that an export lacks is empty. Columns in addition to those of `analysis.flights`:
+    The paper's items and claims and the comparison of platforms select rows and count values. A
+    column that an export lacks is filled with nulls. Columns in addition to those of
+    `analysis.flights`:
         fault: the configured fault as text; equal faults have equal texts.
-        together: whether it strikes all components of a group at once.
-        at: the trigger of a source-level fault; empty without one.
+        together: whether the fault strikes all components of a group at once.
+        at: the trigger of a source-level fault; null without such a fault.
         as_paper: whether vehicle, speed, sensors, the single flip of random bits and the 13 watched
             states are those of the paper. Stack, detector model and `at` may differ.
         struck: whether the fault flipped a bit, read or not, as in the paper's counts.
         lost: whether the mission did not end in success.
-        ended: whether the fault made a node crash or hang.
+        ended: whether a node crashed or hung.
         restart_s: time after which a dead node is restarted.
         repeats: whether the flight is repeatable. A flight of a user's companion is not, so it is
             not paired with a golden flight.
-    Columns about its golden flight:
-        own_lost: whether the golden flight is lost; empty without a golden flight.
+    Columns about the golden flight of the same mission:
+        own_lost: whether the golden flight is lost; null without a golden flight.
         own_flight_time_s: golden flight time.
-        over_own: flight time / golden flight time; empty if either flight is lost.
-        added_s: flight time - golden flight time; empty if either flight is lost.
-        harmed: whether the flight is lost, or takes more than LONGER times as long; empty unless
-            the golden flight succeeds.
-    Columns about the flight with the same fault and no detector, empty without such a flight:
+        over_own: flight time / golden flight time; null if either flight is lost.
+        added_s: flight time - golden flight time; null if either flight is lost.
+        harmed: whether the flight is lost, or takes more than LONGER times as long as the golden
+            flight; null unless the golden flight succeeds.
+    Columns about the flight with the same fault and no detector, null without such a flight:
     bare_struck, bare_ended, bare_lost, bare_over_own, bare_harmed.
     """
 
@@ -121,7 +123,9 @@ class Flights:
 
     @classmethod
     def of(cls, table: pa.Table) -> Flights:
-        """Take the flights from a table of `analysis.flights.flights`, or from an export.
+        """Create the object from a table of `analysis.flights.flights` or an exported campaign.
+
+        Missions that could not begin are omitted.
 
         Raises:
             ConfigError: the flights are a stratified sample, whose missions have unequal weights.
@@ -129,8 +133,9 @@ class Flights:
         there = set(table.column_names)
         if STRATUM in there and table[STRATUM].null_count < table.num_rows:
             raise ConfigError(
-                "the paper's tables and claims count all missions equally, but missions of a "
-                "stratified sample have weights: see `mavfi campaign status --full`"
+                "the paper's tables and claims cannot be computed from a stratified sample, "
+                "because they count all missions equally, but its missions have weights; "
+                "use `mavfi campaign status --full`"
             )
         return cls(_beside_golden(_flown(pa.table({
             name: table[name].cast(kind) if name in there else pa.nulls(table.num_rows, kind)
@@ -139,7 +144,11 @@ class Flights:
 
     @classmethod
     def pooled(cls, several: Iterable[Flights], stack: str | None = None) -> Flights:
-        """Merge the missions of several tables without duplicates, for one stack or for all."""
+        """Merge several tables, keeping only the first of several missions with equal settings.
+
+        Args:
+            stack: keep only the flights of this stack; None keeps all.
+        """
         own = [flights.table.select(_NOTHING_FLOWN.column_names) for flights in several]
         whole = cls(pa.concat_tables([_NOTHING_FLOWN, *own]).combine_chunks())
         whole = whole if stack is None else whole.chosen(stack=stack)
@@ -149,7 +158,10 @@ class Flights:
         return cls(_beside_golden(whole.table.take(pa.array(first.values(), pa.int64()))))
 
     def without(self, left_out: Iterable[bool]) -> Flights:
-        """Leave out the flights for which `left_out` (n,) is true; pair the others anew."""
+        """Return the table without the flights for which `left_out`, of shape (n,), is true.
+
+        The remaining flights are matched again with golden and unprotected flights among them.
+        """
         kept = pa.array([not own for own in left_out], pa.bool_())
         return Flights(_beside_golden(self.table.select(_NOTHING_FLOWN.column_names).filter(kept)))
 
@@ -157,15 +169,15 @@ class Flights:
         return int(self.table.num_rows)
 
     def __getitem__(self, name: str) -> list[Any]:
-        """Return a column; None for empty cells."""
+        """Return the values of a column as a list, with None for nulls."""
         return list(self.table[name].to_pylist())
 
     def rows(self, *names: str) -> list[dict[str, Any]]:
-        """Return the flights as rows of these columns, or of all columns if none are given."""
+        """Return one dictionary per flight, with these columns, or all if none are given."""
         return list((self.table.select(names) if names else self.table).to_pylist())
 
     def numbers(self, name: str) -> FloatArray:
-        """Return a column, (n,); NaN for empty cells."""
+        """Return a column as an array of floats of shape (n,), with NaN for nulls."""
         return tables.numbers(self.table, name)
 
     def known(self, *names: str) -> FloatArray:
@@ -173,37 +185,57 @@ class Flights:
         return tables.known(np.sum([self.numbers(name) for name in names], axis=0))
 
     def flags(self, name: str) -> BoolArray:
-        """Return a boolean column, (n,)."""
+        """Return a column as a boolean array of shape (n,), with False for nulls."""
         return tables.flags(self.table, name)
 
     # Rows
 
     def where(self, chosen: Iterable[bool]) -> Flights:
-        """Return the flights for which `chosen` (n,) is true."""
+        """Return the flights for which `chosen`, of shape (n,), is true."""
         return Flights(self.table.filter(pa.array(chosen, pa.bool_())))
 
     def chosen(self, **values: Any) -> Flights:
-        """Return the flights with these values; None means empty, and a tuple allows several."""
+        """Return the flights whose columns have the given values.
+
+        None matches a null, and a tuple matches any of its items.
+        """
         return Flights(tables.chosen(self.table, **values))
 
     def faulty(self, detector: str | None = None, **values: object) -> Flights:
-        """Return the flights with a fault and with this detector; None means without a detector."""
+        """Return the flights that have a fault and run this detector.
+
+        Args:
+            detector: name of the detector; None selects flights without a detector.
+            values: further conditions on columns, as in `chosen`.
+        """
         struck = Flights(self.table.filter(pc.is_valid(self.table["level"])))
         return struck.chosen(detector=detector, **values)
 
     def struck(self, **values: object) -> Flights:
-        """Return the flights whose fault flipped a bit, by default those without a detector."""
+        """Return the flights without a detector whose fault flipped a bit.
+
+        `values` are further conditions on columns, as in `chosen`. They may replace the condition
+        on `detector`.
+        """
         return self.chosen(**{"struck": True, "detector": None, **values})
 
     def protected(self, detector: str, protect: str = EVERY_STAGE, **values: object) -> Flights:
-        """Return protected flights with a successful golden and a struck unprotected flight."""
+        """Return the flights with this detector whose fault struck, if the golden flight succeeds.
+
+        Whether the fault struck is taken from the flight with the same fault and no detector.
+
+        Args:
+            protect: stages that the detector watches, joined by `+`.
+            values: further conditions on columns, as in `chosen`.
+        """
         seen = {"detector": detector, "protect": protect, "own_lost": False, "bare_struck": True}
         return self.chosen(**seen, **values)
 
     def of_fate(self, fate: Fate) -> Flights:
-        """Return flights without a fault, and those whose fault has this fate without a detector.
+        """Return the flights without a fault, and those whose fault has this fate.
 
-        A fault without an unprotected flight has no fate, so it belongs only to ALL.
+        The fate of a fault is that in its flight without a detector. A fault that was not flown
+        without a detector has no fate, so it belongs only to ALL.
         """
         if fate is Fate.ALL:
             return self
@@ -214,7 +246,7 @@ class Flights:
 
     @property
     def population(self) -> str:
-        """The worlds for which intervals of these flights hold."""
+        """A sentence that says for which worlds the intervals of these flights hold."""
         places = [*zip(self["world"], self["world_seed"], strict=True)]
         named = sorted({place for place in places if place[1] is not None})
         each = ", ".join(f"{world} {seed}" for world, seed in named)
@@ -231,16 +263,20 @@ class Flights:
 
     @property
     def seeds(self) -> list[tuple[str, int]]:
-        """World and seed of each flight; flights with the same seed are not independent."""
+        """The world and the seed of each flight. Flights that share both are not independent."""
         return list(zip(self["world"], self["seed"], strict=True))
 
     def balance(
         self, detector: str, protect: str = EVERY_STAGE, column: str = "harmed", **values: object
     ) -> Balance:
-        """Count the harm that a detector undoes and causes, on the same faults.
+        """Count the missions that a detector saves from harm, and those that it harms.
+
+        Only faults that were flown both without and with the detector count.
 
         Args:
+            protect: stages that the detector watches, joined by `+`.
             column: the kind of harm, `harmed` or `lost`.
+            values: further conditions on columns, as in `chosen`.
         """
         seen = self.protected(detector, protect, **values)
         pairs = zip(seen[f"bare_{column}"], seen[column], strict=True)
@@ -271,11 +307,14 @@ class Flights:
         return self.chosen(protect=(None, EVERY_STAGE))
 
     def shared(self, *names: str, arm: str = "detector") -> Flights:
-        """Return the flights without a fault, and those whose fault has a flight in every arm.
+        """Return the flights without a fault, and those whose fault was flown in every arm.
+
+        The arms are the values of a column, such as the detectors.
 
         Args:
-            names: columns; each combination of their values has its own arms.
-            arm: column whose values are the arms; None, such as no detector, is an arm too.
+            names: columns that split the flights into groups. Each group has its own arms, and a
+                fault is kept if it was flown in every arm of one of the groups.
+            arm: column whose values are the arms; a null, such as no detector, is an arm too.
         """
         arms = self.where(level is not None for level in self["level"]).by(*names, arm)
         groups: dict[tuple[Any, ...], list[set[tuple[str, str]]]] = {}
@@ -286,11 +325,17 @@ class Flights:
         return self.where(level is None or fault in shared for level, fault in faults)
 
     def by(self, *names: str) -> dict[tuple[Any, ...], Flights]:
-        """Group the flights by the values of columns, in the order of the groups' first flights."""
+        """Group the flights by the values of these columns.
+
+        The result is keyed by tuples of values, in the order in which they first occur.
+        """
         return self.grouped(zip(*map(self.__getitem__, names), strict=True))
 
     def grouped(self, keys: Iterable[Any]) -> dict[Any, Flights]:
-        """Group the flights by one key per flight, in the order of the groups' first flights."""
+        """Group the flights by `keys`, which has one key per flight.
+
+        The result is keyed in the order in which the keys first occur.
+        """
         places: dict[Any, list[int]] = {}
         for place, key in enumerate(keys):
             places.setdefault(key, []).append(place)
@@ -299,10 +344,11 @@ class Flights:
     # Numbers
 
     def share(self, column: str = "lost", *, value: bool = True, clustered: bool = False) -> Share:
-        """Return the share of flights whose column equals `value`, among those with a value.
+        """Return the share of flights whose `column` is `value`, among those where it is not null.
 
         Args:
-            clustered: whether the interval includes the design effect of a shared seed.
+            clustered: whether the interval is widened by the design effect of flights that share a
+                seed.
         """
         there = Flights(self.table.filter(pc.is_valid(self.table[column])))
         hits = [cell is value for cell in there[column]]
@@ -312,30 +358,31 @@ class Flights:
 
     @property
     def ratios(self) -> FloatArray:
-        """Flight times divided by those of the missions' golden flights, where both succeed."""
+        """The ratio of each flight's time to that of its golden flight, where both succeed."""
         return self.known("over_own")
 
     @property
     def increases(self) -> FloatArray:
-        """Increase of the flight time over the golden flight's, in per cent, where both succeed."""
+        """The increase of flight time over the golden flight, in per cent, where both succeed."""
         return PERCENT * (self.ratios - 1.0)
 
     @property
     def worst(self) -> WorstCase:
-        """The largest ratios of these protected flights, and of the same faults without a detector.
+        """The largest ratio of flight time to golden flight time, with and without the detector.
 
-        No other unprotected flights count, because a maximum grows with the number of flights.
+        The flights without the detector are those with the same faults. No others count, because a
+        maximum grows with the number of flights.
         """
         return WorstCase.of(OWN, self.known("bare_over_own").tolist(), self.ratios.tolist())
 
     @property
     def faults(self) -> list[tuple[str, str]]:
-        """Mission and fault of each flight; flights with equal entries differ in their detector."""
+        """The pair and the fault of each flight. Flights with equal entries differ in detector."""
         return list(zip(self["pair"], self["fault"], strict=True))
 
     @property
     def worlds(self) -> list[str]:
-        """The worlds of the flights, the paper's first."""
+        """The names of the worlds in which these flights took place, the paper's first."""
         flown = set(self["world"])
         return [*(world for world in WORLDS if world in flown), *sorted(flown - set(WORLDS))]
 
@@ -382,7 +429,10 @@ def _as_paper(config: Mapping[str, Any]) -> bool:
 
 
 def _beside_golden(table: pa.Table) -> pa.Table:
-    """Add the columns that compare each flight with its golden and its unprotected flight."""
+    """Add the columns that compare each flight with its golden and its unprotected flight.
+
+    The class `Flights` describes these columns.
+    """
     unprotected = pc.and_(pc.is_null(table["detector"]), table["repeats"])
     golden = pc.and_(unprotected, pc.equal(table["fault"], _NO_FAULT))
     own = _places(partners(table, table, ("pair",), only=golden))
@@ -410,11 +460,18 @@ def against_golden(
     own_lost: pa.ChunkedArray, own_time_s: pa.ChunkedArray, lost: pa.ChunkedArray,
     time_s: pa.ChunkedArray,
 ) -> tuple[pa.ChunkedArray, pa.ChunkedArray]:  # fmt: skip
-    """Compare flights with their golden flights, whose cells may be empty; all columns are (n,).
+    """Return the ratio of each flight's time to its golden flight's, and whether it is harmed.
+
+    All columns have the shape (n,). Those of the golden flights may have nulls.
+
+    Args:
+        own_lost, own_time_s: whether the golden flight is lost, and its flight time.
+        lost, time_s: whether the flight itself is lost, and its flight time.
 
     Returns:
-        Flight time / golden flight time, empty if either flight is lost; and whether the flight is
-        harmed: lost, or with a ratio above LONGER; empty unless the golden flight succeeds.
+        The column of flight time / golden flight time, null if either flight is lost. And the
+        column that tells whether the flight is harmed, which means that it is lost or that its
+        ratio is above LONGER; null unless the golden flight succeeds.
     """
     succeeds = pc.equal(own_lost, _NO)
     ratio = pc.divide(time_s, own_time_s)
@@ -434,19 +491,19 @@ def partners(
     only: pa.ChunkedArray | BoolArray | None = None,
     repeats: bool = False,
 ) -> IntArray:
-    """Find the partner of each row: the first of the other rows with equal values in columns `on`.
+    """For each row, return the index of the first row of `others` with equal values in `on`.
 
-    Empty cells are equal to each other.
+    That row of `others` is called the partner. Nulls are equal to each other.
 
     Args:
-        rows, others: (n,) and (m,) rows; may be the same table.
+        rows, others: tables with n and m rows; may be the same table.
         on: columns of both tables, of equal types.
-        only: whether each of the other rows may be a partner, (m,); None allows all.
+        only: whether each row of `others` may be a partner, of shape (m,); None allows all.
         repeats: match the second of several equal rows with the second equal partner, and so on.
             Otherwise all of them have the same partner.
 
     Returns:
-        Index of the partner among all the other rows, (n,); -1 for a row without a partner.
+        The index in `others` of each row's partner, of shape (n,), or -1 for a row without one.
     """
     allowed = np.arange(others.num_rows)
     if only is not None:
@@ -470,13 +527,16 @@ def partners(
 
 
 def paired(rows: pa.Table, others: pa.Table, on: Sequence[str]) -> tuple[pa.Table, pa.Table]:
-    """Return the rows that have a partner, and the partners row by row; see `partners`."""
+    """Return the rows that have a partner in `others`, and these partners in the same order.
+
+    `partners` defines the partner of a row by the columns `on`.
+    """
     places = partners(rows, others, on)
     return rows.filter(places >= 0), others.take(places[places >= 0])
 
 
 def _repeat(keys: IntArray) -> IntArray:
-    """Return the number of earlier equal keys for each key, (n,)."""
+    """Return, for each of the n keys, how many earlier keys equal it."""
     order = np.argsort(keys, kind="stable")
     _, begins, counts = np.unique(keys[order], return_index=True, return_counts=True)
     earlier = np.empty(len(keys), dtype=np.int64)
@@ -485,5 +545,5 @@ def _repeat(keys: IntArray) -> IntArray:
 
 
 def _places(partner: IntArray) -> pa.Array:
-    """Return indices for `take`, which gives an empty cell for a missing partner."""
+    """Convert indices of partners for pyarrow's `take`, which gives a null for each -1."""
     return pa.array(partner, mask=partner < 0)

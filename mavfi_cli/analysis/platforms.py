@@ -1,9 +1,9 @@
-"""The numbers of a comparison: settings, ratios between platforms, and costs of faults.
+"""The numbers of a comparison of platforms: results of settings, ratios, and costs of faults.
 
 Flight time, distance, energy and replans are computed over the counted flights that succeeded.
 Response times are computed over all counted flights. A faulty flight counts if its fault struck,
-unless the struck value expired before anything read it. It also counts if a detector withheld the
-value.
+unless the corrupted value expired before anything read it. It also counts if a detector withheld
+the value.
 
 The cost of a fault (Fig. 16 of the paper) is the flight time divided by that of the golden flight
 of the same mission on the same platform, if both reached the goal. The paper measures this in one
@@ -33,7 +33,7 @@ from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval, interval_of_row
 from mavfi_cli.stats.paired import McNemar, WorstCase, sign_flips
 from mavfi_cli.stats.shares import Interval, Share
 
-LATE = 0.95  # quantile given with the worst case, because that has no interval
+LATE = 0.95  # quantile given with the worst case, because the worst case has no interval
 MISSION = ("seed", "target")  # columns that identify a mission on all platforms
 _SAME_S = 1e-6  # flight times this close are equal: a tick is 20 ms
 GOLDEN, NONE = "golden", "none"  # without fault; with fault and without detector
@@ -41,13 +41,13 @@ CONFIDENCE = 0.95  # confidence level of all intervals
 
 
 class _Quantity(NamedTuple):
-    """A quantity that is measured in each flight; `name` is its column."""
+    """A quantity that is measured in each flight; `name` is its column in the table of flights."""
 
     name: str
     title: str
     unit: str
-    any_end: bool = False  # failed flights have it too
-    ratio: bool = True  # platforms are compared by ratio, else by difference
+    any_end: bool = False  # whether failed flights have the quantity too
+    ratio: bool = True  # True compares platforms by ratio, False by difference
 
 
 QUANTITIES = (
@@ -69,7 +69,11 @@ SCHEMA = pa.schema(
 
 
 def compared(flights: pa.Table) -> Flights:
-    """Return ended missions with the columns of SCHEMA; golden flights have an empty target."""
+    """Return the flown missions with the additional columns `setting` and `target` of SCHEMA.
+
+    The setting is the detector, or `golden` or `none` for flights without a detector. The target is
+    that of the fault, and empty for flights without a fault.
+    """
     table = Flights.of(flights).table
     bare = pc.if_else(pc.is_null(table["level"]), GOLDEN, NONE)
     table = table.append_column("setting", pc.coalesce(table["detector"], bare))
@@ -78,7 +82,10 @@ def compared(flights: pa.Table) -> Flights:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlatformSummary:
-    """A platform of a comparison; `platform` is its name or file, `title` its name in tables."""
+    """A platform of a comparison, with its cores, power and kernel latencies.
+
+    `platform` is its name or the path of its file, `title` its name in tables.
+    """
 
     platform: str
     title: str
@@ -90,7 +97,14 @@ class PlatformSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedPlan:
-    """The plan of a comparison."""
+    """The plan of a comparison of platforms, as stored in `compare.json`.
+
+    Attributes:
+        inject: targets of the faults: stages, states or groups.
+        missions: number of missions per platform, setting and target.
+        seed: seed of the faults.
+        field: field of the flipped bits; None for any bit.
+    """
 
     platforms: tuple[PlatformSummary, ...]
     world: str
@@ -105,14 +119,14 @@ class ComparedPlan:
 
     @property
     def flip(self) -> str:
-        """The bits flipped in each faulty flight, in words; empty if there are no faults."""
+        """A phrase for the bits that are flipped in each faulty flight; empty without faults."""
         bits = "one bit" if self.field is None else f"one bit of the {self.field}"
         return f"{bits} in {', '.join(self.inject)}" if self.inject else ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredQuantity:
-    """A quantity over the flights of a setting."""
+    """The median, mean and largest value of a quantity over the flights of a setting."""
 
     unit: str
     median: Interval
@@ -122,7 +136,14 @@ class MeasuredQuantity:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SettingFlights:
-    """The flights of a setting on a platform."""
+    """The results of the flights of one setting on one platform.
+
+    Attributes:
+        flown, counted: number of flights, and of those that count for the other results.
+        outcomes: number of counted flights by outcome.
+        success: share of counted flights that succeed.
+        quantities: the measured quantities, keyed by name.
+    """
 
     platform: str
     setting: str
@@ -135,7 +156,10 @@ class SettingFlights:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChangedQuantity(Interval):
-    """The change of a quantity between platforms: mean `ratio` or `difference`, with interval."""
+    """The change of a quantity from the reference platform to another, with its interval.
+
+    `kind` tells what the value is: a mean `ratio` or a mean `difference`.
+    """
 
     kind: str
     unit: str
@@ -143,14 +167,24 @@ class ChangedQuantity(Interval):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _SuccessChange(McNemar):
-    """Successes on two platforms, and the difference of the rates; NaN without pairs."""
+    """McNemar's test of success on two platforms, with the difference of the success rates.
+
+    The difference is NaN if no mission was flown on both platforms.
+    """
 
     difference: float = field()  # replaces the base class's property, so that `asdict` has it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RatioRow:
-    """The ratios of a platform to the reference platform, mission by mission."""
+    """The comparison of a platform with the reference platform over the same missions.
+
+    Attributes:
+        pairs: number of missions that count on both platforms.
+        both_succeed: number of these missions that succeed on both platforms.
+        success: comparison of the success rates.
+        quantities: the change of each quantity, keyed by name.
+    """
 
     platform: str
     setting: str
@@ -163,7 +197,10 @@ class RatioRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _CostInSeconds:
-    """Flight time minus golden flight time; the interval resamples missions, not faults."""
+    """Flight time minus golden flight time: mean and largest value, in seconds.
+
+    The confidence interval is bootstrapped over missions, not over faults.
+    """
 
     mean: Interval
     largest: float
@@ -171,11 +208,11 @@ class _CostInSeconds:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _CostRatio:
-    """Flight time divided by that of the golden flight.
+    """Flight time divided by golden flight time: 95th percentile and largest value.
 
     Attributes:
-        recovered_share: the part of the largest increase without a detector that the detector
-            removes; NaN if there is no increase.
+        recovered_share: share of the largest increase without a detector that the detector removes;
+            NaN if there is no increase or no detector.
     """
 
     p95: Interval
@@ -185,7 +222,7 @@ class _CostRatio:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorstFault:
-    """The seed and the fault of a flight, with which it can be repeated."""
+    """The mission seed, the target and the fault seed with which a flight can be repeated."""
 
     seed: int
     target: str
@@ -194,12 +231,15 @@ class WorstFault:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CostRow:
-    """The cost of the faults of a setting on a platform.
+    """How much longer the faults of one setting make the flights on one platform.
 
     Attributes:
-        pairs: number of faulty flights that reached the goal, as did their golden flights.
+        pairs: number of faulty flights that reached the goal and whose golden flights did so too.
         lost: number of faulty flights that failed although their golden flights reached the goal.
-        worst_flight: the one with the largest ratio; among equals, the one with the lowest seed.
+        cost_s: flight time minus golden flight time.
+        over_own: flight time divided by golden flight time.
+        worst_flight: the flight with the largest ratio; among equals, the one with the lowest seed.
+            None if `pairs` is 0.
     """
 
     platform: str
@@ -218,12 +258,15 @@ class CostRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CostDifference:
-    """The additional cost of the same faults compared with the reference platform.
+    """How much more the same faults cost on a platform than on the reference platform.
+
+    The cost of a fault is the flight time minus the golden flight time on the same platform.
 
     Attributes:
-        pairs: faults that have a cost on both platforms.
+        pairs: number of faults that have a cost on both platforms.
         differ: number of pairs with different costs.
-        extra_s, p_value: mean difference of costs and its p-value, with missions as units.
+        extra_s: mean difference of the costs, with an interval bootstrapped over missions.
+        p_value: p-value of this difference, from a sign-flip test with missions as units.
         p95_ratio: ratio of the 95th percentiles of flight time / own golden flight time.
         largest_ratio: the same for the largest values, over all flights of each platform.
         longest_ratio: ratio of the longest flight times, over all flights of each platform.
@@ -243,12 +286,16 @@ class CostDifference:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LongestFlight:
-    """The longest successful flight of a setting, and its ratio to the mean golden one.
+    """The longest successful flight of a setting, compared with the mean golden flight.
 
     Attributes:
+        flights: number of successful flights.
+        golden_mean_s: mean time of the golden flights.
+        worst_s: time of the longest flight of the setting.
+        over_mean_ratio: `worst_s` / `golden_mean_s`.
         over_mean_recovered_share: share of the increase over the mean golden flight that the
             detector recovers; NaN if the longest flight with faults is no longer than the longest
-            golden one.
+            golden one, or if the setting has no detector.
     """
 
     platform: str
@@ -262,7 +309,7 @@ class LongestFlight:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedTimelines:
-    """Timelines of one mission: one for each platform whose flight reacted to a frame."""
+    """Timelines of one mission: one for each platform whose flight reacted to a depth frame."""
 
     seed: int
     platforms: list[Timeline]
@@ -270,7 +317,7 @@ class ComparedTimelines:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlatformComparison:
-    """The contents of `compare.json`.
+    """The contents of `compare.json`: the plan and all results of a comparison of platforms.
 
     `settings`, `costs` and `worst` have one row per platform and setting. `ratios` and
     `cost_differences` have one row per setting and platform other than the first. Shares, increases
@@ -278,6 +325,7 @@ class PlatformComparison:
 
     Attributes:
         flights: one row per flight, with the columns of SCHEMA.
+        errors: one text for each mission that could not begin.
     """
 
     confidence: float = CONFIDENCE
@@ -295,11 +343,11 @@ class PlatformComparison:
 
 
 def figures(plan: ComparedPlan, flights: Flights, **about: Any) -> PlatformComparison:
-    """Compute all numbers of a comparison.
+    """Compute all results of a comparison from its flights.
 
     Args:
-        flights: flights with the columns of SCHEMA.
-        about: the other fields of the comparison.
+        flights: the flights that `compared` returns, with the columns of SCHEMA.
+        about: the other fields of `PlatformComparison`.
     """
     platforms, settings = [row.platform for row in plan.platforms], plan.settings
     first, *others = platforms
@@ -374,7 +422,10 @@ def _ratio(
 
 
 def _changed(quantity: _Quantity, first: pa.Table, second: pa.Table) -> ChangedQuantity:
-    """Return the geometric mean ratio, or mean difference if values may be zero, with interval."""
+    """Return the change of a quantity from the first flight of each pair to the second.
+
+    It is the geometric mean of the ratios, or the mean difference for quantities that may be zero.
+    """
     if not quantity.any_end:
         both = pa.array(~(flags(first, "lost") | flags(second, "lost")))
         first, second = first.filter(both), second.filter(both)
@@ -391,18 +442,24 @@ def _changed(quantity: _Quantity, first: pa.Table, second: pa.Table) -> ChangedQ
 
 @dataclass(frozen=True, slots=True)
 class FaultCosts:
-    """The cost of the faults of a platform and setting, relative to their own golden flights."""
+    """The costs of the faults in the counted flights of one platform and one setting.
+
+    Each flight is compared with its own golden flight.
+    """
 
     counted: Flights
 
     @property
     def costs(self) -> pa.Table:
-        """The faulty flights that reached the goal, as did their golden flights."""
+        """The faulty flights that reached the goal and whose golden flights did so too."""
         return self.counted.timed.table
 
     @property
     def longest_s(self) -> float:
-        """Longest flight that reached the goal, whether or not the golden one did."""
+        """The longest time, in seconds, of a flight that reached the goal.
+
+        The golden flight need not have reached it. NaN if no flight did.
+        """
         times_s = self.counted.chosen(lost=False).numbers("flight_time_s")
         return max(times_s.tolist(), default=math.nan)
 
@@ -410,9 +467,13 @@ class FaultCosts:
         return max(numbers(self.costs, measure).tolist(), default=math.nan)
 
     def row(self, platform: str, setting: str) -> CostRow:
-        """Compute the cost of a setting's faults on a platform.
+        """Summarise the costs of these faults in one row of the comparison.
 
-        Several faults of one mission are not independent, so the intervals resample missions.
+        Several faults of one mission are not independent, so the intervals are bootstrapped over
+        missions.
+
+        Args:
+            platform, setting: names to put into the row.
         """
         cost_s, over_own = (_by_mission(self.costs, name) for name in ("added_s", "over_own"))
         count = len(cost_s)
@@ -440,7 +501,12 @@ class FaultCosts:
     def beyond(
         self, first: FaultCosts, platform: str, setting: str, reference: str
     ) -> CostDifference:
-        """Compute the additional cost compared with the reference platform, `first`."""
+        """Compute how much more the same faults cost here than on the reference platform.
+
+        Args:
+            first: costs of the same setting on the reference platform.
+            platform, setting, reference: names to put into the result.
+        """
         here, there = paired(self.costs, first.costs, MISSION)
         extra = _by_mission(here, "added_s") - _by_mission(there, "added_s")
         extra[np.abs(extra) < _SAME_S] = 0.0
@@ -483,7 +549,10 @@ def _longest(
 
 
 def _by_mission(costs: pa.Table, measure: str) -> FloatArray:
-    """Return the values, (missions, targets), in the order of seeds; NaN if there is no flight."""
+    """Return the values of a column as an array of shape (missions, targets).
+
+    Rows are in the order of the seeds. A value is NaN if the mission has no flight with the target.
+    """
     seeds, row = np.unique(np.asarray(costs["seed"].to_pylist()), return_inverse=True)
     targets, column = np.unique(np.asarray(costs["target"].to_pylist()), return_inverse=True)
     table = np.full((len(seeds), len(targets)), np.nan)
@@ -492,7 +561,13 @@ def _by_mission(costs: pa.Table, measure: str) -> FloatArray:
 
 
 def _over(count: int, statistic: Callable[[IntArray], FloatArray]) -> Interval:
-    """Return a statistic of mission indices (..., missions), with its interval over missions."""
+    """Return the value of `statistic` with a confidence interval bootstrapped over missions.
+
+    Args:
+        count: number of missions.
+        statistic: takes mission indices of shape (..., missions) and returns an array of shape
+            (...).
+    """
     return interval_of_rows(count, statistic, resamples=TABLE_RESAMPLES)
 
 
@@ -502,9 +577,10 @@ def _mean(values: FloatArray) -> FloatArray:
 
 
 def _late(values: FloatArray) -> FloatArray:
-    """Return the LATE quantile over the last two axes, ignoring NaN.
+    """Return the LATE quantile of the values over the last two axes, ignoring NaN.
 
-    It sorts, which puts NaN last, because `numpy.nanquantile` would loop over rows.
+    The values are sorted, which puts NaN last. `numpy.nanquantile` would be slower, because it
+    loops over rows.
     """
     flat = np.sort(values.reshape((*values.shape[:-2], -1)), axis=-1)
     place = LATE * (np.count_nonzero(~np.isnan(flat), axis=-1) - 1)
@@ -519,7 +595,7 @@ def _late(values: FloatArray) -> FloatArray:
 
 
 def summaries(platforms: Sequence[str]) -> tuple[PlatformSummary, ...]:
-    """Describe platforms, given by name or file."""
+    """Load platforms, which are given by name or file, and return a summary of each."""
     names, profiles = titles(platforms), {name: load_platform(name) for name in platforms}
     return tuple(
         PlatformSummary(
@@ -535,7 +611,10 @@ def summaries(platforms: Sequence[str]) -> tuple[PlatformSummary, ...]:
 
 
 def titles(platforms: Sequence[str]) -> dict[str, str]:
-    """Return platform names for tables and pictures: a file's stem, if that is unique."""
+    """Return the name of each platform for tables and pictures, keyed by its name or file.
+
+    A file is named by its stem, unless another platform has the same name.
+    """
     short = [name.removesuffix(".toml").rpartition("/")[2] for name in platforms]
     return {
         name: stem if short.count(stem) == 1 else name

@@ -1,6 +1,6 @@
 """Recorded flights as seen by detectors: samples for fitting, and one score per replayed flight.
 
-The score of an unprotected flight is the highest score of its messages, in units of the detector's
+The score of an unprotected flight is the highest score of its messages, divided by the detector's
 threshold. With a score above 1, the gate would have raised an alarm. Nothing is withheld during the
 replay, so a message's score does not depend on the threshold. Steps of the active plan are scored
 too.
@@ -46,13 +46,16 @@ def scored(
     pairs: tuple[pa.Table, pa.Table],
     note: Callable[[str], None],
 ) -> Scored:
-    """Compute the detectors' scores for the harmful faults and for the error-free flights.
+    """Replay flights through detectors. Return a function that looks up the scores of a detector.
+
+    The scored flights are the unprotected ones with a harmful fault, and the golden ones.
 
     Args:
-        detectors: all except `none`.
-        folder: its file SCORES holds the scores by run folder; only missing scores are computed.
-        pairs: tables without faults and with one, as `detectors.pairs_of` returns them.
-        note: receives a text with the number of replayed flights.
+        detectors: the detectors to score, without `none`.
+        folder: folder whose file SCORES caches the scores by run folder. Only missing scores are
+            computed.
+        pairs: the pairs without a fault and those with one, as `detectors.pairs_of` returns them.
+        note: called with a text that tells how many flights are replayed.
     """
     store = folder / SCORES
     kept: dict[str, dict[str, float | None]] = {}
@@ -83,7 +86,10 @@ def scored(
         write_json(store, kept)
 
     def known(path: str | None, detector: str) -> float | None:
-        """Return a flight's score, infinite for a NaN; None if the flight was not replayed."""
+        """Return the score of a flight, or None if the flight was not replayed.
+
+        A stored null, which stands for NaN or infinity, gives an infinite score.
+        """
         if path is None or Path(path).name not in scores[detector]:
             return None
         score = scores[detector][Path(path).name]
@@ -116,13 +122,19 @@ def _seen_of(path: Path) -> _Seen:
 
 
 def _value(state: str, pattern: str) -> float | int | bool:
-    """Decode a value from its bits, because a record contains only finite numbers."""
+    """Decode the value of a state from its bits in hexadecimal.
+
+    The bits are used because a record contains only finite numbers.
+    """
     kind = bits.NUMPY_TYPES[BY_NAME[state].dtype.value]
     return kind.value(int(pattern, 16))
 
 
 def _score(seen: _Seen, struck_s: float | None, detector: DetectorConfig, stack: str) -> float:
-    """Return the highest score, since the strike if there is one, in units of the threshold."""
+    """Return the highest score of a flight, divided by the detector's threshold.
+
+    If a fault struck, only messages from `struck_s` on count. A NaN score gives infinity.
+    """
     columns, plans, strikes = seen
     if not columns:  # the flight ended before the first tick
         return 0.0
@@ -142,20 +154,21 @@ def _score(seen: _Seen, struck_s: float | None, detector: DetectorConfig, stack:
 
 
 def flown_samples(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], int, set[str]]:
-    """Collect the samples of the error-free flights among the run folders in `flown`.
+    """Collect training samples from the error-free flights of a stack in the folder `flown`.
 
     Returns:
-        The samples, the number of flights that are not error-free, and the autopilots of the
-        others. A flight is named after its world, or after its run folder if an earlier flight has
-        the same world and seed.
+        The samples of each error-free flight, the number of runs that were rejected because they
+        are not error-free flights of the stack, and the autopilots of the error-free flights. A
+        flight is named after its world, or after its run folder if an earlier flight has the same
+        world and seed.
 
     Raises:
-        ModelError: no flight is error-free.
+        ModelError: no run in the folder is an error-free flight of the stack.
     """
     runs = [load_run(path) for path in sorted(flown.glob(f"*/{RESULT}"))]
     usable = [run for run in runs if _is_error_free(run, stack)]
     if not usable:
-        problem = f"no error-free flight of the stack {stack.name!r} among {len(runs)} runs"
+        problem = f"none of the {len(runs)} runs is an error-free flight of stack {stack.name!r}"
         raise ModelError(problem, path=flown)
     flights: dict[tuple[str, int], FlightSamples] = {}
     for run in usable:

@@ -1,7 +1,7 @@
-"""Summary of a campaign: its settings, and comparisons of their missions.
+"""Summary of a campaign: results of each setting, and comparisons between settings.
 
-The flights of a user's companion are not repeatable, so they have no pairs: such settings are
-compared as independent samples.
+The flights of a user's companion are not repeatable, so they cannot be paired: settings with such
+flights are compared as independent samples.
 
 Only the short rows of the ledger are read, because a campaign may have a million missions.
 """
@@ -39,16 +39,17 @@ _WORDS = ("outcome", "injected", "pair", STRATUM)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SettingSummary:
-    """Counts and means of one setting.
+    """The results of one setting of a campaign: counts of missions, success rates and means.
 
     Attributes:
-        name: its labels in one phrase.
+        name: the labels of the setting in one phrase.
         planned, errors: number of missions on the list, and of those that could not begin.
         outcomes, injected: number of flown missions by outcome, and by the fate of the fault.
-        success: success rate over golden missions and faults that struck.
+        success: success rate over the counted missions: golden ones, and those whose fault struck,
+            unless the struck value expired before anything read it.
         inactive: success rate over faults that were not injected or not activated.
         every: success rate over all flown missions, as in the paper.
-        metrics: means over the successful missions that `success` counts, by METRICS.
+        metrics: mean of each of the METRICS over the successful missions that `success` counts.
     """
 
     labels: Labels
@@ -64,19 +65,21 @@ class SettingSummary:
 
     @property
     def faulty(self) -> bool:
-        """Whether any of its flown missions has a fault."""
+        """Whether any flown mission of the setting has a fault."""
         return any(kind != Injected.GOLDEN.value for kind in self.injected)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
-    """Comparison of two settings over the missions flown in both.
+    """Comparison of two settings of a campaign over the missions that were flown in both.
 
     Attributes:
         first, second: labels of the reference and of the other setting.
-        name: phrase for the other setting.
-        corrected_p: p-value of `success`, corrected by Holm over all comparisons of this kind.
-        differences: second minus first over the pairs in which both succeeded, by METRICS.
+        name: the labels of the other setting in one phrase.
+        success: McNemar's test of success in the two settings.
+        corrected_p: p-value of `success` after Holm's correction over all comparisons of this kind.
+        differences: mean of second minus first for each of the METRICS, over the pairs in which
+            both flights succeeded.
         over_own: largest ratio of a flight time to that of the golden flight of the same mission,
             if both succeeded.
         over_mean: ratio of the longest of these flights to the mean of their golden flights, as in
@@ -100,16 +103,16 @@ class UnpairedComparison:
 
     Attributes:
         first, second: labels of the reference and of the other setting.
-        name: phrase for the other setting.
-        first_success, second_success: success rate of each.
-        difference: second minus first, with Newcombe's interval.
-        p_value, corrected_p: p-value of Fisher's exact test, and the same corrected by Holm over
-            all comparisons of this kind.
-        differences: mean over the successful flights of the second minus that of the first, by
-            METRICS, with Welch's interval.
+        name: the labels of the other setting in one phrase.
+        first_success, second_success: success rate of each setting.
+        difference: second success rate minus the first, with Newcombe's interval.
+        p_value, corrected_p: p-value of Fisher's exact test, and the same after Holm's correction
+            over all comparisons of this kind.
+        differences: for each of the METRICS, the mean over the successful flights of the second
+            setting minus that of the first, with Welch's interval.
         golden: success rate of the golden flights.
-        golden_deviation: standard deviation over the successful golden flights, by METRICS; NaN
-            with fewer than two.
+        golden_deviation: standard deviation of each of the METRICS over the successful golden
+            flights; NaN if there are fewer than two.
     """
 
     first: Labels
@@ -127,13 +130,14 @@ class UnpairedComparison:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quality:
-    """A metric of a setting over its successful missions.
+    """The distribution of one metric over the successful missions of one setting.
 
     Attributes:
-        least, median, most: smallest, median and largest value; NaN without flights.
-        difference: difference from the golden flights of the same missions, or from all golden
-            flights if flights are not repeatable; None for golden settings, and for settings with
-            flights of both kinds.
+        name: the labels of the setting in one phrase.
+        least, median, most: smallest, median and largest value; NaN without successful missions.
+        difference: mean difference from the golden flights of the same missions, or from all golden
+            flights if flights are not repeatable; None for golden settings, for settings that have
+            no golden flights to compare with, and for settings with flights of both kinds.
     """
 
     labels: Labels
@@ -148,14 +152,15 @@ class Quality:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignSummary:
-    """The results of a campaign by setting.
+    """The results of a campaign: one row per setting, and comparisons between settings.
 
     Attributes:
         missions: number of missions on the list.
         over, missing: number of missions with a result, and without one.
         confidence: confidence level of all intervals.
         sampling: how faults were drawn, `uniform` or `stratified`.
-        faults: each setting with faults compared with the golden one.
+        cells: the results of each setting.
+        faults: each setting with faults compared with its golden setting.
         protection: each protected setting compared with the unprotected one with the same faults.
         unpaired_faults, unpaired_protection: the same for flights that are not repeatable.
     """
@@ -178,18 +183,18 @@ class CampaignSummary:
 
 @dataclass(frozen=True)  # no slots: cached properties need a dict
 class Group:
-    """Missions that are counted together.
+    """The missions of one setting, or of several settings that are counted together.
 
     Attributes:
-        labels: common labels.
-        lacked: grouping labels that these missions lack.
+        labels: the labels that these missions share.
+        lacked: labels by which missions are grouped and that these missions do not have.
         planned, errors: number of missions on the list, and of those that could not begin.
-        watched: whether a detector watches all of them.
-        flights: the flown missions, in the order of the list: `number`, `cell`, `outcome`,
-            `injected`, METRICS, `stratum`, `weight`, `pair` and `strike`. Golden, faulty and
-            protected flights of a mission share the code `pair`. Labels that differ only in
-            TREATMENT share the code `strike`, which stands for the fault. `repeats` is 0 for the
-            flights of a user's companion.
+        watched: whether every one of these missions runs a detector.
+        flights: a table of the flown missions, in the order of the list, with the columns `number`,
+            `cell`, `outcome`, `injected`, METRICS, `stratum`, `weight`, `pair`, `strike` and
+            `repeats`. Golden, faulty and protected flights of a mission share the code `pair`.
+            Settings whose labels differ only in TREATMENT share the code `strike`, which stands for
+            the fault. `repeats` is 0 for the flights of a user's companion.
     """
 
     labels: Labels
@@ -201,7 +206,7 @@ class Group:
 
     @property
     def name(self) -> str:
-        """A phrase for the labels, and for the grouping labels that the missions lack."""
+        """A phrase made of the labels, and of the grouping labels that the missions do not have."""
         if not self.lacked or "setting" in self.labels:  # the setting's name is enough
             return label_text(self.labels)
         less = "golden" if self.flights.num_rows and self.golden else f"no {', '.join(self.lacked)}"
@@ -209,17 +214,21 @@ class Group:
 
     @cached_property
     def metrics(self) -> Mapping[str, FloatArray]:
-        """The values of METRICS, (n,) each; NaN where a mission has none."""
+        """The values of each of the METRICS, as an array of shape (n,) with NaN for nulls."""
         return {name: numbers(self.flights, name) for name in METRICS}
 
     @cached_property
     def succeeded(self) -> BoolArray:
-        """Whether each mission reached its goal, (n,)."""
+        """Whether each mission reached its goal, as an array of shape (n,)."""
         return self.among("outcome", (Outcome.SUCCESS.value,))
 
     @cached_property
     def counted(self) -> BoolArray:
-        """Whether each mission is golden or its fault struck, (n,)."""
+        """Whether each mission counts for the success rate, as an array of shape (n,).
+
+        A mission counts if it is golden, or if its fault struck, unless the struck value expired
+        before anything read it.
+        """
         return self.among("injected", COUNTED)
 
     @cached_property
@@ -229,14 +238,17 @@ class Group:
 
     @cached_property
     def repeats(self) -> BoolArray:
-        """Whether each flight is repeatable, (n,)."""
+        """Whether each flight is repeatable, as an array of shape (n,)."""
         return self.codes("repeats").astype(bool)
 
     @staticmethod
     def parts(groups: Iterable[Group], *, repeats: bool) -> list[Group]:
-        """Return each setting with only its repeatable flights, or with only the others.
+        """Return each group with only its repeatable flights, or with only its other flights.
 
-        Settings that have none are left out.
+        Groups that have no such flights are omitted.
+
+        Args:
+            repeats: True keeps the repeatable flights, False keeps the others.
         """
         chosen = [(group, group.repeats == repeats) for group in groups]
         return [
@@ -247,20 +259,20 @@ class Group:
 
     @cached_property
     def pairs(self) -> IntArray:
-        """The distinct pairs of the counted missions."""
+        """The distinct codes `pair` of the counted missions, in ascending order."""
         return np.unique(self.codes("pair")[self.counted])
 
     def codes(self, name: str) -> IntArray:
-        """Return an integer column, (n,)."""
+        """Return an integer column of `flights` as an array of shape (n,)."""
         return np.asarray(self.flights[name].to_numpy(), dtype=np.int64)
 
     def among(self, name: str, words: Iterable[str]) -> BoolArray:
-        """Return whether each mission has one of these words in a text column, (n,)."""
+        """Return whether the text column of each mission equals one of `words`, with shape (n,)."""
         matches = pc.is_in(self.flights[name], value_set=pa.array(sorted(words), pa.string()))
         return np.asarray(matches.to_numpy(), dtype=bool)
 
     def counts(self, name: str) -> dict[str, int]:
-        """Count the occurrences of each word in a column."""
+        """Count the missions for each value of a text column. The values are in sorted order."""
         entries = pc.value_counts(self.flights[name]).to_pylist()
         return dict(sorted((entry["values"], entry["counts"]) for entry in entries))
 
@@ -271,21 +283,28 @@ class Group:
 
     @cached_property
     def weights(self) -> FloatArray | None:
-        """The weight of each mission, (n,); None in a uniform sample."""
+        """The weight of each mission, as an array of shape (n,), or None in a uniform sample."""
         return numbers(self.flights, WEIGHT) if self.stratified else None
 
     @cached_property
     def clusters(self) -> IntArray | None:
-        """The cluster of each mission, (n,), if a uniform sample has several faults per pair.
+        """The cluster of each mission, as an array of shape (n,), or None if all are independent.
 
-        Such faults strike the same invocation of a node, so their effects are correlated.
+        A cluster is the faults of one pair in a uniform sample that has several faults per pair.
+        They strike the same invocation of a node, so their effects are correlated.
         """
         places = np.column_stack([self.codes("cell"), self.codes("pair")])
         alone = self.golden or self.stratified or len(np.unique(places, axis=0)) == len(places)
         return None if alone else self.codes("pair")
 
     def share(self, hits: BoolArray, chosen: BoolArray, confidence: float = 0.95) -> Share:
-        """Return the share of `hits` among `chosen` missions, (n,) each, by weight and cluster."""
+        """Return the share of hits among the chosen missions, with its confidence interval.
+
+        It takes weights and clusters of the missions into account.
+
+        Args:
+            hits, chosen: whether each mission is a hit, and whether it is chosen, of shape (n,).
+        """
         if self.clusters is not None:
             own, places = hits[chosen].tolist(), self.clusters[chosen].tolist()
             effect = design_effect(own, [("", place) for place in places])
@@ -304,11 +323,14 @@ class Group:
         return self.share(self.succeeded, self.counted, confidence)
 
     def successes(self, metric: str) -> FloatArray:
-        """Return a metric of the counted successful missions that have it."""
+        """Return the values of a metric, without nulls, for the counted missions that succeeded."""
         return known(self.metrics[metric][self.succeeded & self.counted])
 
     def mean(self, metric: str, confidence: float = 0.95) -> Interval:
-        """Return the mean of `successes`, by weight and cluster."""
+        """Return the mean of a metric over the counted missions that succeeded, with its interval.
+
+        It takes weights and clusters of the missions into account.
+        """
         values = self.metrics[metric]
         there = self.succeeded & self.counted & ~np.isnan(values)
         weights = None if self.weights is None else self.weights[there]
@@ -316,12 +338,19 @@ class Group:
         return _interval(values[there], confidence, weights, clusters)
 
     def deviation(self, metric: str) -> float:
-        """Return the standard deviation of `successes`; NaN with fewer than two."""
+        """Return the standard deviation of a metric over the counted missions that succeeded.
+
+        The result is NaN if fewer than two of them have a value.
+        """
         values = self.successes(metric)
         return float(np.std(values - values[0], ddof=1)) if len(values) > 1 else np.nan
 
     def golden_among(self, groups: Sequence[Group]) -> Group | None:
-        """Return the golden setting that shares the most pairs, if any; None if this is golden."""
+        """Return the golden group that shares the most pairs with this group, or None.
+
+        Golden groups with a detector are ignored. None means that no golden group shares a pair, or
+        that this group is itself golden.
+        """
         if self.golden:
             return None
         shared = [
@@ -333,11 +362,12 @@ class Group:
         return groups[-most[1]] if most[0] else None
 
     def matched(self, other: Group) -> tuple[IntArray, IntArray]:
-        """Return the row indices (m,) of matching counted missions, in this group and the other.
+        """Return the row indices of matching missions, in this group and in the other group.
 
-        They are in the other's order. Missions of a pair match if this group is golden, or if they
-        have the same fault. If a pair was flown several times, the first flights match, then the
-        second ones, and so on. A golden flight matches every flight of its pair.
+        Both arrays have the shape (m,) and the order of the other group. Only counted missions
+        match. Missions of a pair match if this group is golden, or if they have the same fault. If
+        a pair was flown several times, the first flights match, then the second ones, and so on. A
+        golden flight matches every flight of its pair.
         """
         there = np.flatnonzero(other.counted)
         here = partners(
@@ -351,7 +381,14 @@ class Group:
 
 
 def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
-    """Merge settings with equal labels `by`. Raise UnknownName if no setting has such a label."""
+    """Group the missions of a campaign by labels, one group per combination of label values.
+
+    Args:
+        by: names of the labels; empty groups by all labels, which gives one group per setting.
+
+    Raises:
+        UnknownName: no setting has a label with one of these names.
+    """
     labels = ledger.cells()
     names = {name for setting in labels for name in setting}
     for name in by:
@@ -408,7 +445,12 @@ def _fault_text(changes: str) -> str:
 
 
 def _split(whole: pa.Table, members: Sequence[Sequence[int]], cells: int) -> list[pa.Table]:
-    """Return the rows of each group of cells, in the order of the list."""
+    """Split the rows of a table into one table per group of settings, keeping their order.
+
+    Args:
+        members: numbers of the settings (`cell`) of each group.
+        cells: number of all settings.
+    """
     group_of = np.zeros(cells, dtype=np.int64)
     for index, cells_of_group in enumerate(members):
         group_of[cells_of_group] = index
@@ -421,7 +463,7 @@ def _split(whole: pa.Table, members: Sequence[Sequence[int]], cells: int) -> lis
 
 @dataclass(frozen=True, slots=True)
 class _Arms:
-    """Two settings to compare, and their golden setting."""
+    """Two settings to compare, and the golden setting that both refer to."""
 
     first: Group
     second: Group
@@ -430,28 +472,34 @@ class _Arms:
 
 @dataclass(frozen=True, slots=True)
 class _Match(_Arms):
-    """Two settings, their golden setting, and the row indices of their pairs, (m,) in each."""
+    """Two settings to compare, with their m pairs of matching flights.
+
+    `at_first` and `at_second` hold the row indices of the pairs in each setting, of shape (m,).
+    """
 
     at_first: IntArray
     at_second: IntArray
 
     @property
     def success(self) -> tuple[BoolArray, BoolArray]:
-        """Success of the first and of the second flight of each pair, (m,) each."""
+        """Whether the first and whether the second flight of each pair succeeded, (m,) each."""
         return self.first.succeeded[self.at_first], self.second.succeeded[self.at_second]
 
     @property
     def clusters(self) -> IntArray | None:
-        """The cluster of each pair, (m,), as in `Group`."""
+        """The cluster of each pair, of shape (m,), or None if all are independent; see `Group`."""
         return None if self.second.clusters is None else self.second.clusters[self.at_second]
 
     @property
     def weights(self) -> FloatArray | None:
-        """The weight of each pair, (m,): that of its fault; None in a uniform sample."""
+        """The weight of the fault of each pair, of shape (m,), or None in a uniform sample."""
         return None if self.second.weights is None else self.second.weights[self.at_second]
 
     def difference(self, metric: str, confidence: float) -> Interval:
-        """Return second minus first, over the pairs in which both succeeded and have the metric."""
+        """Return the mean of second minus first of a metric, with its confidence interval.
+
+        It covers the pairs in which both flights succeeded and have the metric.
+        """
         first, second = self.success
         change = self.second.metrics[metric][self.at_second]
         change = change - self.first.metrics[metric][self.at_first]
@@ -461,9 +509,10 @@ class _Match(_Arms):
         return _interval(change[there], confidence, weights, clusters)
 
     def worst(self) -> tuple[WorstCase, WorstCase]:
-        """Return worst cases relative to each pair's golden flight, and to the mean of these.
+        """Return the worst flight times, in two ways, over the pairs whose golden flight succeeded.
 
-        A pair counts only if its golden flight succeeded.
+        The first worst case is relative to the golden flight of each pair. The second is relative
+        to the mean of these golden flights.
         """
         if self.first.golden:
             golden, sides = self.at_first, [(self.second, self.at_second)]
@@ -485,7 +534,7 @@ class _Match(_Arms):
         )
 
     def _golden_of_first(self) -> IntArray:
-        """Return the row index of the golden flight of each pair, (m,); -1 if there is none."""
+        """Return the row index of each pair's golden flight, of shape (m,), or -1 without one."""
         own = np.full(self.first.flights.num_rows, -1)
         at_golden, at_faulty = self.golden.matched(self.first)
         own[at_faulty] = at_golden
@@ -493,7 +542,10 @@ class _Match(_Arms):
 
     @staticmethod
     def _times(group: Group, places: IntArray) -> FloatArray:
-        """Return the flight times of successful flights, (m,); NaN for others and at index -1."""
+        """Return the flight time at each row index, or NaN if the flight failed or the index is -1.
+
+        The indices and the times have the shape (m,).
+        """
         times_s = np.full(len(places), np.nan)
         there = (places >= 0) & group.succeeded[places]
         times_s[there] = group.metrics["flight_time_s"][places[there]]
@@ -522,7 +574,7 @@ def _protection(groups: Sequence[Group]) -> list[_Arms]:
 
 
 def _paired(arms: Sequence[_Arms], confidence: float) -> list[Comparison]:
-    """Compare settings over the missions flown in both."""
+    """Compare the two settings in each of `arms` over the missions that were flown in both."""
     matches = [
         _Match(own.first, own.second, own.golden, *own.first.matched(own.second)) for own in arms
     ]
@@ -551,7 +603,7 @@ def _paired(arms: Sequence[_Arms], confidence: float) -> list[Comparison]:
 
 
 def _unpaired(arms: Sequence[_Arms], confidence: float) -> list[UnpairedComparison]:
-    """Compare settings as independent samples."""
+    """Compare the two settings in each of `arms` as independent samples."""
     arms = [own for own in arms if own.first.counted.any() and own.second.counted.any()]
     shares = [(own.first.success(confidence), own.second.success(confidence)) for own in arms]
     p_values = [first.fisher(second) for first, second in shares]
@@ -586,7 +638,11 @@ def _interval(
     weights: FloatArray | None,
     clusters: IntArray | None,
 ) -> Interval:
-    """Return the mean with its interval; with clusters, that of the independent cluster means."""
+    """Return the mean of the values with its confidence interval.
+
+    With clusters, both are computed from the means of the clusters, because only these are
+    independent of each other.
+    """
     if clusters is not None and len(values):
         _, which = np.unique(clusters, return_inverse=True)
         values = np.bincount(which, values) / np.bincount(which)
@@ -596,7 +652,12 @@ def _interval(
 def summarise(
     ledger: Ledger, settings: Sequence[Group], confidence: float = 0.95
 ) -> CampaignSummary:
-    """Summarise the flown missions of a ledger by its settings; see `groups`."""
+    """Summarise the flown missions of a campaign: results by setting, and comparisons.
+
+    Args:
+        settings: the groups of missions to summarise, as `groups` returns them.
+        confidence: confidence level of all intervals.
+    """
     missions, over = ledger.planned(), ledger.over()
     pairs, apart = (Group.parts(settings, repeats=repeats) for repeats in (True, False))
     return CampaignSummary(
@@ -633,7 +694,10 @@ def _setting(group: Group, confidence: float) -> SettingSummary:
 
 
 def qualities(groups: Sequence[Group], confidence: float = 0.95) -> list[Quality]:
-    """Return every metric of every setting over its successful missions, metric by metric."""
+    """Summarise each metric over the successful missions of each setting.
+
+    The result has one row per metric and setting, metric by metric.
+    """
     pairs, apart = (
         {
             row.name: row.differences

@@ -1,7 +1,7 @@
 """Kernel invocations from a depth frame to the first setpoint that depends on it.
 
-They are taken from a recorded time table. When an invocation starts, its input is the newest output
-of the preceding kernel, because the queues keep only the newest message.
+They are taken from the recorded timetable of a flight. When an invocation starts, its input is the
+newest output of the preceding kernel, because the queues keep only the newest message.
 """
 
 from __future__ import annotations
@@ -30,18 +30,22 @@ Span = tuple[float, float]  # begin and end, s after the frame's stamp
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timeline:
-    """At least one second of a flight; times are in s after the stamp of a typical depth frame.
+    """The kernel invocations and setpoints in a window of a flight around a typical depth frame.
+
+    The window is at least one second long. All times except `frame_stamp_s` are in seconds after
+    the frame's stamp.
 
     Attributes:
         platform: name of the platform.
         frame_stamp_s: simulated time of the frame.
         response_s: time of the first setpoint that depends on the frame.
-        answer: the pilot's reaction.
-        plan_setpoint_s: time of the first setpoint of the new plan; None without one.
-        shown_s: the time window.
-        chain_s: the invocations that led to the setpoints, by kernel.
-        lanes_s: all invocations in the window, by kernel.
-        setpoints_s: all setpoints in the window.
+        answer: the pilot's reaction to the frame, in words.
+        plan_setpoint_s: time of the first setpoint of the new plan; None if the reaction led to no
+            new plan.
+        shown_s: begin and end of the window.
+        chain_s: begin and end of the invocations that led to the setpoints, by kernel.
+        lanes_s: begin and end of all invocations in the window, by kernel.
+        setpoints_s: times of all setpoints in the window.
     """
 
     platform: str
@@ -56,13 +60,13 @@ class Timeline:
 
 
 def timelines(runs: Mapping[str, Run]) -> list[Timeline]:
-    """Return timelines of equal length for the platforms whose flight reacted to a frame.
+    """Return equally long timelines of all platforms whose flight reacted to a depth frame.
 
     Args:
-        runs: runs with time table and trace, by platform.
+        runs: one run per platform, with its timetable and trace, keyed by the platform's name.
 
     Raises:
-        RecordError: a time table cannot be read.
+        RecordError: a timetable cannot be read.
     """
     alone = [_timeline_of(name, run) for name, run in runs.items()]
     longest_s = max((line.shown_s[1] for line in alone if line), default=LEAST_S)
@@ -70,10 +74,11 @@ def timelines(runs: Mapping[str, Run]) -> list[Timeline]:
 
 
 def _timeline_of(platform: str, run: Run, least_s: float = LEAST_S + _MARGIN_S) -> Timeline | None:
-    """Return the timeline of a flight, at least `least_s` long; None without a reaction.
+    """Return the timeline of a flight, or None if no setpoint of the flight reacted to a frame.
 
-    If a verdict made the vehicle slow down or stop, the timeline is that of a frame with such a
-    verdict, and lasts at least until the first setpoint of the new plan.
+    The timeline lasts at least until `least_s` after the frame. If a foreseen collision made the
+    vehicle slow down or stop, the timeline is that of a frame with this effect, and lasts at least
+    until the first setpoint of the new plan.
     """
     ran, reactions = run.folder.read_timetable()
     answers = {event.stamp_s: event.text for event in run.record.events if event.kind in _ANSWERS}
@@ -117,10 +122,13 @@ def _timeline_of(platform: str, run: Run, least_s: float = LEAST_S + _MARGIN_S) 
 
 
 def _typical(reactions: Sequence[Reaction], answers: Collection[float]) -> Reaction | None:
-    """Return the reaction whose duration is closest to the flight's median; the first if tied.
+    """Return the reaction whose duration is closest to the median of all, or None without any.
+
+    Ties go to the earliest frame.
 
     Args:
-        answers: stamps of setpoints; reactions that end in one of them are preferred.
+        answers: stamps of setpoints. If some reactions end in one of them, only these are
+            candidates.
     """
     if not reactions:
         return None
@@ -137,9 +145,9 @@ def _typical(reactions: Sequence[Reaction], answers: Collection[float]) -> React
 
 
 def _chain_of(invocations: Sequence[Invocation], reaction: Reaction) -> list[Invocation]:
-    """Return the chain of invocations from a frame to its setpoint, in order, control last.
+    """Return the invocations that led from a frame to its setpoint, in order, control last.
 
-    The chain is shorter if some are missing from the timetable.
+    The list is shorter if invocations are missing from the timetable.
     """
     chain: list[Invocation] = []
     before_s = reaction.setpoint_stamp_s
@@ -155,7 +163,10 @@ def _chain_of(invocations: Sequence[Invocation], reaction: Reaction) -> list[Inv
 
 
 def _planned(invocations: Sequence[Invocation], answer_s: float) -> Invocation | None:
-    """Return the planner's first invocation after a reaction; None after _PLAN_WITHIN_S."""
+    """Return the first invocation of the planner that starts at or after `answer_s`, or None.
+
+    None means that no invocation starts within _PLAN_WITHIN_S.
+    """
     for invocation in invocations:
         if invocation.node == "planner" and invocation.start_s >= answer_s - _SAME_S:
             return invocation if invocation.start_s <= answer_s + _PLAN_WITHIN_S else None
@@ -165,7 +176,10 @@ def _planned(invocations: Sequence[Invocation], answer_s: float) -> Invocation |
 def _answered(
     invocations: Sequence[Invocation], stamps_s: Sequence[float], ready_s: float
 ) -> float | None:
-    """Return the stamp of the first setpoint that uses an output ready at `ready_s`, or None."""
+    """Return the stamp of the first setpoint that uses an output ready at `ready_s`, or None.
+
+    None means that the flight has no such setpoint.
+    """
     for invocation in invocations:
         if invocation.node == "control" and invocation.start_s >= ready_s - _SAME_S:
             delay_s = invocation.end_s - invocation.start_s
@@ -175,9 +189,9 @@ def _answered(
 
 
 def timeline_seed(flights: pa.Table, platforms: Sequence[str]) -> int | None:
-    """Return the seed of the first mission that succeeds and replans on all platforms.
+    """Return the lowest seed of a golden mission that succeeds on all platforms, or None.
 
-    If none does both, return that of the first mission that succeeds on all platforms, or None.
+    Missions that also replan on all platforms are preferred.
 
     Args:
         flights: golden and other flights, with the columns of `platforms.SCHEMA`.

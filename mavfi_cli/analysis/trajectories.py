@@ -1,4 +1,4 @@
-"""The golden, faulty and protected flights of one mission, for a picture (Fig. 13)."""
+"""Selects the golden, faulty and protected flights of one mission for a picture (Fig. 13)."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ class _DrawnFlight:
     """One flight of a picture.
 
     Attributes:
-        number: number of its mission.
-        name: name of its setting, with details only where the panel has several of that name.
-        flight_time_s: None if the flight has none.
-        path: its run folder.
+        number: number of the flight's mission.
+        name: name of the flight's setting, with details only where the panel has several flights
+            with that name.
+        flight_time_s: flight time; None if the record has none.
+        path: run folder of the flight.
     """
 
     number: int
@@ -37,11 +38,11 @@ class _DrawnFlight:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Panel:
-    """The flights of one fault.
+    """The flights that are drawn together for one fault.
 
     Attributes:
-        title: the fault in words; empty without one.
-        flights: golden ones first, protected ones last.
+        title: the fault in words; empty for golden flights alone.
+        flights: golden flights first, protected flights last.
     """
 
     title: str
@@ -50,11 +51,11 @@ class _Panel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MissionPicture:
-    """The flights that share world, start and noise, by panel.
+    """The contents of a picture of one pair: flights with the same world, start and noise.
 
     Attributes:
-        panels: one for each fault; at least one.
-        absent: one line per mission that is not in the picture, with the reason.
+        panels: one panel for each fault; at least one.
+        absent: one line per mission of the pair that is not in the picture, with the reason.
     """
 
     panels: Sequence[_Panel]
@@ -77,12 +78,12 @@ class _Flown:
 
     @property
     def cut_off(self) -> bool:
-        """Whether its process ended before it wrote the record."""
+        """Whether the process that flew the mission ended before it wrote the record."""
         return self.path is not None and self.path.is_dir() and not (self.path / RESULT).is_file()
 
     @property
     def setting(self) -> str:
-        """The setting's name in the specification, otherwise a description."""
+        """The name of the setting in the campaign's specification, or a description if unnamed."""
         named = self.labels.get("setting")
         if named is not None:
             return str(named)
@@ -91,7 +92,7 @@ class _Flown:
 
     @property
     def treatment(self) -> list[str]:
-        """Values of the labels that distinguish its setting from others of the same name."""
+        """The values of the labels that tell settings with the same name apart."""
         values = (self.labels.get(name) for name in TREATMENT[1:])
         return [
             "no detector" if value == "none" else str(value)
@@ -103,7 +104,9 @@ class _Flown:
 def pair(
     ledger: Ledger, number: int | None = None, among: Collection[int] | None = None
 ) -> MissionPicture:
-    """Find the flights that share world, start and noise with a mission.
+    """Return the flights of the pair that contains a mission, arranged for a picture.
+
+    The flights of a pair share world, start and noise.
 
     Args:
         number: number of the mission. None selects, among the pairs with all run folders, the one
@@ -112,14 +115,15 @@ def pair(
         among: numbers of the missions to choose from and to draw; None means all.
 
     Raises:
-        ConfigError: the list has no such mission.
-        RecordError: its pair has not been flown, or not all of its run folders were kept.
+        ConfigError: the campaign's list has no mission with this number.
+        RecordError: no mission of the pair has been flown, not all of their run folders were kept,
+            or none of the flights left a record.
     """
     listed = {row[0]: row for row in ledger.rows()}
     chosen = listed.keys() if among is None else among
     number = _most_prolonged(ledger, chosen) if number is None else number
     if number not in listed:
-        problem = f"has no mission {number}; the list has {number_span(ledger)}"
+        problem = f"mission {number} does not exist; the list has {number_span(ledger)}"
         raise ConfigError(problem, path=ledger.folder)
     pairs = {other: pair for other, _, pair, _ in listed.values()}
     mine = [other for other in pairs if pairs[other] == pairs[number] and other in chosen]
@@ -136,14 +140,16 @@ def pair(
     ]
     if not flown:
         raise RecordError(
-            f"{ledger.folder}: no mission in the pair of mission {number} has been flown"
+            f"{ledger.folder}: no mission of the pair that contains mission {number} has been flown"
         )
     lost = [flight.number for flight in flown if flight.path is None]
     if lost:
         raise RecordError(f"{ledger.folder}: no run folder of {_missions(lost)} was kept; {_KEPT}")
     whole = [flight for flight in flown if not flight.cut_off]
     if not whole:
-        raise RecordError(f"{ledger.folder}: {_missions(mine)} left no record to draw")
+        raise RecordError(
+            f"{ledger.folder}: cannot draw {_missions(mine)}, because none of them left a record"
+        )
     missing = sorted(set(mine) - {row["number"] for row in over})
     return MissionPicture(
         panels=_panels(ledger, whole),

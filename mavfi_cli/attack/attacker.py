@@ -1,4 +1,4 @@
-"""Runs one fault: reaches its location, flips and follows bits, runs to the end and judges."""
+"""Runs a target with one fault: stops at its instruction, flips bits, and judges the run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Task = tuple[int, InstructionFault | None]  # number and fault; None: drawn when
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunResult:
-    """The result of one faulty run."""
+    """The result of one run with a fault, or of a null run."""
 
     outcome: RunOutcome
     signal: int | None
@@ -39,7 +39,7 @@ class RunResult:
     run_s: float  # wall time of the whole run
 
     def completed(self, planned: FaultRecord) -> FaultRecord:
-        """Return the completed record of a planned run."""
+        """Return the record of the run: the planned record, completed with this result."""
         fault = self.fault
         if fault is not None and not planned["trigger"]:  # a time trigger, which is not repeatable
             planned = {
@@ -64,10 +64,13 @@ class RunResult:
 
 
 def golden_run(place: JudgedPlace) -> Golden:
-    """Make fault-free runs and require equal results. Return the first, with the longest times.
+    """Make `GOLDEN_RUNS` fault-free runs, and require equal results.
+
+    Returns:
+        The first run, with the CPU time and the duration of the slowest runs.
 
     Raises:
-        TargetError: a run fails, or the outputs differ.
+        TargetError: a run fails, or the results differ.
     """
     runs = [place.fault_free() for _ in range(GOLDEN_RUNS)]
     for again in runs[1:]:
@@ -80,13 +83,13 @@ def golden_run(place: JudgedPlace) -> Golden:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Attacker:
-    """Runs faults in one place and compares them with one golden run."""
+    """Runs a target with faults in one place, and judges each run against one golden run."""
 
     place: JudgedPlace
     golden: Golden
 
     def run(self, fault: InstructionFault) -> RunResult:
-        """Run once, with a fault at an exact execution of an instruction.
+        """Run the target once, with `fault` at the exact execution that its trigger names.
 
         Raises:
             FaultError: the location holds an instruction other than the drawn one.
@@ -111,7 +114,10 @@ class Attacker:
     def run_timed(
         self, plan: Strategy, rng: np.random.Generator, *, null: bool = False
     ) -> RunResult:
-        """Run once, with a fault at a random moment of the golden run's CPU time or duration.
+        """Run the target once, with a fault at a random moment.
+
+        The moment is uniform over the CPU time or the duration of the golden run, as the rule
+        requires. The fault is drawn from the instruction that is about to execute at that moment.
 
         Args:
             null: leave out the flip.
@@ -162,7 +168,7 @@ class Attacker:
         return None, reason
 
     def _corrupt(self, start: float, tracee: Tracee, fault: InstructionFault) -> RunResult:
-        """Flip bits just before the attacked instruction, follow them, and run to the end."""
+        """Apply the fault at its instruction, follow the corrupted bits, and run to the end."""
         injection, followed = None, NOTHING
         with self._deadline(tracee) as alarm:
             window = self.place.limits.follow_window
@@ -200,7 +206,7 @@ class Attacker:
 
 
 def run_out(tracee: Tracee) -> Ended:
-    """Let a run continue to its end."""
+    """Let the process run to its end, and return how it ended."""
     while tracee.ended is None:
         tracee.resume()
     return tracee.ended

@@ -51,12 +51,13 @@ def count_executions(
     native_s: Callable[[Executions], float | None],
     report: Callable[[str], None] = lambda _: None,
 ) -> tuple[int, Executions]:
-    """Run a program under callgrind; return its exit code and its execution counts.
+    """Run a program under callgrind, and return its exit code and its execution counts.
 
     Args:
         counts: path of callgrind's output. Callgrind also writes numbered files with this prefix.
-        native_s: maps the execution counts so far to the CPU time of a native run up to that
-            point, s; returns None if that is unknown.
+        golden: the golden run, whose duration limits that of the run under callgrind.
+        native_s: maps the execution counts so far to the CPU time, in seconds, of a native run up
+            to that point, or to None if the time is unknown.
         report: called every second with a description of the progress.
 
     Raises:
@@ -86,14 +87,14 @@ def count_executions(
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
     if code < 0:
-        raise TargetError(name, f"was killed by signal {-code} under callgrind")
+        raise TargetError(name, f"was killed by signal {-code} while it ran under callgrind")
     count.read_rest()
     return code, count.executions
 
 
 @dataclass(slots=True)
 class _Count:
-    """The counts of a run so far, with a forecast of its end."""
+    """The execution counts of a run so far, and a forecast of how long the run takes."""
 
     counts: Path
     golden: Golden
@@ -107,11 +108,11 @@ class _Count:
 
     @property
     def limit_s(self) -> float:
-        """The longest allowed duration."""
+        """The longest allowed duration of the run under callgrind, in seconds."""
         return _SLOWER * self.golden.wall_s + _START_S
 
     def update(self) -> str:
-        """Read the new files; return a description of the progress."""
+        """Add the counts of newly finished files, and return a description of the progress."""
         elapsed_s = time.monotonic() - self.begun_s
         if self._read_files():
             counted = sum(sum(counts.values()) for counts in self.executions.values())
@@ -130,12 +131,12 @@ class _Count:
             yield f"about {max(0.0, self.forecast_s - elapsed_s):.0f} s left"
 
     def read_rest(self) -> None:
-        """Read the remaining files after callgrind has ended."""
+        """Add the counts of the remaining files, after callgrind has ended."""
         self._read_files()
         self._add(self.counts)
 
     def _read_files(self) -> bool:
-        """Read the new numbered files; return False if there are none."""
+        """Add the counts of newly finished numbered files. Return False if there are none."""
         before = self.read
         while _is_complete(path := Path(f"{self.counts}.{self.read + 1}")):
             self._add(path)
@@ -151,7 +152,7 @@ class _Count:
 def _await_end(
     process: subprocess.Popen[bytes], name: str, count: _Count, report: Callable[[str], None]
 ) -> int:
-    """Wait for the exit code, and report progress meanwhile."""
+    """Wait for callgrind to end, report its progress meanwhile, and return its exit code."""
     while (left_s := count.begun_s + count.limit_s - time.monotonic()) > 0:
         with contextlib.suppress(subprocess.TimeoutExpired):
             return process.wait(min(_REPORT_EVERY_S, left_s))
@@ -160,7 +161,7 @@ def _await_end(
 
 
 def _is_complete(path: Path) -> bool:
-    """Return True if callgrind has finished a file: its last line is the total."""
+    """Return True if callgrind has finished the file, which then ends with a line of totals."""
     try:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _LAST_BYTES))
@@ -170,11 +171,11 @@ def _is_complete(path: Path) -> bool:
 
 
 def _read_counts(path: Path) -> dict[str, Counter[int]]:
-    """Return execution counts by the path of the object and the linked address.
+    """Read the execution counts in a file, keyed by the path of the object, then by address.
 
     Args:
-        path: callgrind's file, with linked addresses; the line after `calls=` is the cost of the
-            called function.
+        path: a file of callgrind, with linked addresses. The line after `calls=` holds the cost of
+            the called function and is skipped.
     """
     counts: dict[str, Counter[int]] = {}
     current: Counter[int] = Counter()

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """The faults to draw for a campaign. `runs` is the number of runs of each target."""
+    """How a campaign draws its faults. Each target gets `runs` faults, one for each run."""
 
     runs: int
     seed: int
@@ -65,11 +65,11 @@ class Plan:
     null: bool = False  # leave out the flip
 
     def strategy(self) -> Strategy:
-        """Return the sampling strategy."""
+        """Return the strategy by which faults are drawn, from `rule`, `model` and `compat`."""
         return Strategy.of(self.rule, self.model, compat=self.compat)
 
     def to_json(self, target: AttackTarget) -> Json:
-        """Return the settings that determine a target's results, except the number of runs."""
+        """Return the settings of plan and target that determine the results, except `runs`."""
         return {
             "seed": self.seed,
             "rule": self.rule,
@@ -87,7 +87,7 @@ Stage = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetRuns:
-    """All runs of one target in numerical order, with the profiles of their faults."""
+    """All runs of one target, ordered by number, and the profiles that their faults come from."""
 
     target: AttackTarget
     context: Mapping[str, Any]  # entries about the target in every record
@@ -105,7 +105,7 @@ class TargetRuns:
 
     @property
     def profile(self) -> TargetProfile | None:
-        """The profile of the first input."""
+        """The profile of the first input, or None if the faults are drawn by time."""
         return self.profiles[0]
 
     def input_of(self, run: int) -> int:
@@ -113,7 +113,7 @@ class TargetRuns:
         return run % len(self.goldens)
 
     def records_of(self, number: int) -> tuple[FaultRecord, ...]:
-        """Return the runs on one input."""
+        """Return the records of the runs whose faults strike input `number`."""
         return self.records[number :: len(self.goldens)]
 
 
@@ -127,10 +127,13 @@ def run_campaign(
     stage: Stage = lambda _: None,
     notice: Stage = lambda _: None,
 ) -> list[TargetRuns]:
-    """For every target, make its golden run, profile the target, draw the faults and run them.
+    """Run a campaign of faults against each target, and return the runs of every target.
+
+    For each target: make golden runs, profile its instructions, draw the faults, and make one run
+    with each fault.
 
     Args:
-        targets: one or more targets; several need distinct streams.
+        targets: one or more targets. If there are several, their random streams must differ.
         folder: receives the list of faults before the first run, and the record of each run
             as it ends. Runs that it already holds are not repeated.
         progress: called with the target's name and its number of completed runs, first with 0
@@ -211,7 +214,10 @@ def _attack(
 def _prepare(
     plan: Plan, target: AttackTarget, stage: Stage, notice: Stage
 ) -> tuple[JudgedPlace, tuple[Golden, ...], Profiles]:
-    """Open the target. Make the golden run and the profile of each input."""
+    """Open the target, and make a golden run and a profile for each of its inputs.
+
+    The profiles are None if the rule draws faults by time.
+    """
     stage("loading")
     with contextlib.ExitStack() as undo:
         place = target.open()
@@ -233,7 +239,7 @@ def _prepare(
 
 
 def _report_steps(stage: Callable[[str], None]) -> Watch:
-    """Return a `Watch` that reports stepped instructions, or a status text, to `stage`."""
+    """Return a `Watch` that passes progress to `stage`: stepped instructions so far, or a text."""
     total = 0
 
     def watch(news: int | str) -> None:
@@ -247,7 +253,10 @@ def _report_steps(stage: Callable[[str], None]) -> Watch:
 
 
 def _draw(plan: Plan, setup: _TargetSetup, prepared: TargetRuns) -> list[FaultRecord]:
-    """Make the records of all faults before they run; a time rule draws its fault at the stop."""
+    """Draw all faults of a target, and return their records as planned.
+
+    A fault that is drawn by time gets a record without an instruction. It is drawn during its run.
+    """
     chosen, records = plan.strategy(), list[FaultRecord]()
     for index in range(plan.runs):
         number = prepared.input_of(index)
@@ -276,7 +285,10 @@ _claims: list[socket.socket] = []  # of this process
 
 @contextmanager
 def one_processor() -> Iterator[None]:
-    """Stay on one processor, where the constant switches between tracer and target are fastest."""
+    """Keep this process on one processor within the context.
+
+    Tracer and target alternate constantly, and switching is fastest on one processor.
+    """
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, [_claimed_processor()])
     try:
@@ -287,10 +299,10 @@ def one_processor() -> Iterator[None]:
 
 @functools.lru_cache(maxsize=1)
 def _claimed_processor() -> int:
-    """Claim a processor that no other campaign uses, for this process and its children.
+    """Claim a processor for this process and its children, and return the processor's number.
 
-    The claim is an abstract socket name, so it ends with the process. If all processors are
-    claimed, one is shared.
+    No other campaign uses a claimed processor. The claim is an abstract socket name, so it ends
+    with the process. If all processors are claimed, one of them is shared.
     """
     claim, processors = socket.socket(socket.AF_UNIX), sorted(os.sched_getaffinity(0), reverse=True)
     _claims.append(claim)
@@ -310,7 +322,7 @@ def _give_up_processor() -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _TargetSetup:
-    """A plan, a target and its golden runs, as plain values that a worker process can receive."""
+    """A plan, a target and its golden runs, as plain values that can be sent to a worker."""
 
     plan: Plan
     target: AttackTarget
@@ -322,11 +334,11 @@ class _TargetSetup:
         return tuple(Attacker(place=part, golden=golden) for part, golden in pairs)
 
     def generator(self, *what: str | int) -> np.random.Generator:
-        """Return a generator of the target's stream for one purpose, such as drawing one fault."""
+        """Return a random generator from the target's stream. `what` names its purpose."""
         return Stream.FAULT.generator(self.plan.seed, *self.target.stream, *what)
 
     def draw(self, profiles: Profiles, index: int) -> InstructionFault | None:
-        """Draw fault number `index`; return None for a time rule."""
+        """Draw fault number `index`. Return None if the rule draws faults by time."""
         profile = profiles[index % len(profiles)]
         if profile is None:
             return None
@@ -337,7 +349,10 @@ _opened: dict[tuple[str, ...], tuple[Attacker, ...]] = {}  # the only target tha
 
 
 def _keep_open(setup: _TargetSetup, place: JudgedPlace) -> tuple[Attacker, ...]:
-    """Keep a place open for later chunks, and close the previous one."""
+    """Keep `place` open for later chunks of tasks, and return one attacker for each of its inputs.
+
+    The place that was open before is closed.
+    """
     _close()
     return _opened.setdefault(setup.target.stream, setup.attackers(place))
 
@@ -370,7 +385,10 @@ def _work(job: tuple[_TargetSetup, Sequence[Task]]) -> list[tuple[int, RunResult
 
 
 def _settle(campaign: int) -> None:
-    """Prepare a worker process; SIGTERM ends it without leaving a process or a folder behind."""
+    """Prepare a worker process, which ends together with the process `campaign`.
+
+    SIGTERM ends the worker without leaving a process or a folder behind.
+    """
     die_with(campaign)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the campaign
     signal.signal(signal.SIGTERM, _leave)
@@ -383,7 +401,7 @@ def _leave(*_: object) -> NoReturn:
 
 
 class _AttackWorkers:
-    """The worker processes of one campaign, or this process if `jobs` is 1; a context manager."""
+    """Context manager for the worker processes of one campaign, or this process if `jobs` is 1."""
 
     def __init__(self, jobs: int) -> None:
         self._jobs = jobs
@@ -407,7 +425,7 @@ class _AttackWorkers:
         _give_up_processor()
 
     def take(self, setup: _TargetSetup, place: JudgedPlace) -> None:
-        """Keep a place for runs in this process, or close it if worker processes do the runs."""
+        """Keep `place` open for runs in this process, or close it if workers do the runs."""
         if self._pool is None:
             _keep_open(setup, place)
         else:
@@ -415,7 +433,7 @@ class _AttackWorkers:
             _give_up_processor()
 
     def null(self, setup: _TargetSetup) -> Run:
-        """Return a function that runs tasks without their flips."""
+        """Return a function that makes null runs: it runs tasks, but leaves out their flips."""
         without = replace(setup, plan=replace(setup.plan, null=True))
 
         def run(tasks: Sequence[Task]) -> Iterator[tuple[int, RunResult]]:
@@ -425,7 +443,7 @@ class _AttackWorkers:
         return run
 
     def run(self, setup: _TargetSetup, tasks: Sequence[Task]) -> Iterator[tuple[int, RunResult]]:
-        """Run the tasks; yield their results in order.
+        """Run the tasks, and yield the number and result of each, in the order of the tasks.
 
         Raises:
             FaultError: a worker process was killed.
@@ -475,10 +493,10 @@ def replay_runs(
     runs: int = 0,
     program: ProgramTarget | None = None,
 ) -> Iterator[_Replay]:
-    """Repeat the runs that a campaign's folder holds.
+    """Repeat recorded runs from a campaign's folder, and yield how each differs from its record.
 
     Args:
-        kernels: names of the kernels; empty for all built-in ones.
+        kernels: names of the kernels whose runs are repeated; empty for all built-in kernels.
         runs: number of runs to repeat per kernel, or of the program; 0 for all.
         program: the program that the user named. The folder may come from somebody else, so the
             program recorded there is executed only if it is the same.
@@ -506,10 +524,10 @@ def replay_runs(
                 record.require_same_build(entry, image)
                 number = entry.get("input", 0)
                 if not 0 <= number < len(attackers):
-                    raise RecordError(f"{folder}: a run has no input {number}")
+                    raise RecordError(f"{folder}: a run has an unknown input number, {number}")
                 yield _replay(attackers[number], entry)
     if not repeated:
-        raise RecordError(f"{folder}: holds no repeatable runs")
+        raise RecordError(f"{folder}: holds no run that can be repeated")
 
 
 def _targets(
@@ -527,8 +545,8 @@ def _targets(
             raise RecordError(f"{folder}: holds runs of a program, not of {' and '.join(kernels)}")
         if program is None:
             raise ConfigError(
-                f"holds runs of a program, {plan['program']!r}, which would be executed: if you "
-                "trust it, repeat --program and its other options",
+                f"holds runs of the program {plan['program']!r}, which would be executed: if you "
+                "trust it, give --program and the other options of the campaign again",
                 path=folder,
             )
         known = {"stdin": None, "files": None, **program.settings()}
@@ -538,7 +556,7 @@ def _targets(
         yield program
         return
     if program is not None:
-        raise ConfigError("holds no runs of a program", path=folder)
+        raise ConfigError("holds no runs of a program, so omit --program", path=folder)
     if "inputs_sha256" not in plan:
         raise RecordError(f"{folder}: holds no runs of kernels or of a program")
     if plan.get("sources") != own_digest():  # other code has another memory layout

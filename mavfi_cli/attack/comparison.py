@@ -22,12 +22,12 @@ _SEPARATORS = re.compile(rb"[\s,;:=()\[\]]+")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
-    """The difference between an output and the golden one.
+    """The difference between the output of a run and that of the golden run.
 
     Attributes:
         relative: the value to compare with a tolerance; inf if the outputs cannot be compared
             number by number (different shapes, different kinds of answer, not a number).
-        absolute: the same in `unit`, or inf.
+        absolute: the difference in `unit`, or inf if the outputs cannot be compared.
         unit: unit of `absolute`.
         text: the difference in words.
         noticeable: whether it exceeds what the consumer of the output tolerates.
@@ -42,7 +42,7 @@ class Difference:
     parts: Mapping[str, float] = field(default_factory=dict)
 
     def to_json(self) -> Json:
-        """Return the entries for a record. Non-finite sizes become null."""
+        """Return the difference as entries of a record. An infinite difference becomes null."""
         finite = math.isfinite(self.relative)
         return {
             "relative": self.relative if finite else None,
@@ -56,7 +56,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputComparison:
-    """The outputs to compare, and the rules of the comparison.
+    """The outputs of a program to compare with the golden run, and the rules of the comparison.
 
     Attributes:
         files: compared files, relative to the folder in which the program runs.
@@ -74,15 +74,16 @@ class OutputComparison:
     def of(
         cls, outputs: Iterable[str], *, tolerance: float = 0.0, ignored: Iterable[str] = ()
     ) -> OutputComparison:
-        """Make a comparison from options of the command line.
+        """Create a comparison from command-line options.
 
         Args:
-            outputs: `stdout`, or `file:PATH` relative to the program's folder; empty for standard
-                output.
+            outputs: the outputs to compare, each `stdout` or `file:PATH` with a path relative to
+                the program's folder; empty for standard output alone.
+            ignored: regular expressions; a line that matches one is ignored.
 
         Raises:
-            ConfigError: an output is neither of the two, a path leads out of the program's
-                folder, or a pattern is not a regular expression.
+            ConfigError: an output has neither form, a path leads out of the program's folder, or a
+                pattern is not a regular expression.
         """
         chosen = tuple(dict.fromkeys(outputs)) or (STDOUT,)
         return cls(
@@ -93,7 +94,7 @@ class OutputComparison:
         )
 
     def to_json(self) -> Json:
-        """Return the settings that determine the results."""
+        """Return the settings of the comparison, as entries of a campaign's plan."""
         names: list[str | None] = [None] if self.stdout else []
         names += self.files
         entries: Json = {"file": names[0] if len(names) == 1 else names}
@@ -102,7 +103,10 @@ class OutputComparison:
         return entries | {"tolerance": self.tolerance}
 
     def parts(self, folder: Path, stdout: Path) -> dict[str, bytes | None]:
-        """Read a run's outputs by name; None for a file that is missing or outside the folder."""
+        """Read the outputs of a run without their ignored lines, keyed by name.
+
+        The value is None for a file that is missing, or if a link leads out of `folder`.
+        """
         outputs: dict[str, bytes | None] = {}
         if self.stdout:
             outputs[STDOUT] = self._kept(_beginning(stdout))
@@ -120,7 +124,10 @@ class OutputComparison:
         )
 
     def difference(self, golden: bytes, output: bytes) -> Difference | None:
-        """Return the difference between the numbers of two outputs; None if other text differs."""
+        """Return the largest relative difference between the numbers of two outputs.
+
+        Returns None if the outputs differ in more than their numbers.
+        """
         size = _magnitude(golden, output)
         return None if size is None else Difference(relative=size, absolute=size)
 
@@ -157,7 +164,10 @@ def _pattern(text: str) -> bytes:
 
 
 def _read_inside(folder: Path, name: str) -> bytes | None:
-    """Read a regular file below the folder; None if it is missing or a link leads out of it."""
+    """Return the contents of a regular file below `folder`.
+
+    Returns None if the file is missing or a link leads out of the folder.
+    """
     path = (folder / name).resolve()
     if not path.is_relative_to(folder.resolve()) or not path.is_file():
         return None
@@ -165,7 +175,7 @@ def _read_inside(folder: Path, name: str) -> bytes | None:
 
 
 def _beginning(path: Path) -> bytes:
-    """Return the contents of a file, truncated to one byte more than can be compared."""
+    """Return the contents of a file, cut off one byte after the largest size that is allowed."""
     with path.open("rb") as file:
         return file.read(LARGEST_BYTES + 1)
 

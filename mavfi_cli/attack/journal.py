@@ -24,7 +24,7 @@ _DRAWN = ("object", "offset", "trigger", "k", "instruction_bytes", "corruption",
 
 
 class Journal:
-    """Reads and extends the folder of one campaign."""
+    """The folder of one campaign, which receives the planned faults and the completed runs."""
 
     def __init__(
         self,
@@ -34,7 +34,7 @@ class Journal:
         runs: int,
         kernels: Sequence[str] | None = None,
     ) -> None:
-        """Open the folder, or create it.
+        """Open the folder of a campaign, or create it.
 
         Args:
             known: everything that determines the campaign's results, as plain values.
@@ -54,19 +54,22 @@ class Journal:
             stored = read_plan(folder)
             differs = sorted(key for key in {*known, *stored} if stored.get(key) != known.get(key))
             if differs:
-                raise ConfigError(f"holds another campaign; it differs in {differs}", path=folder)
+                raise ConfigError(f"holds a campaign with other values of {differs}", path=folder)
         self._require_all(runs, kernels)
         write_json(path, known)
         self._end_last_line()
 
     def _end_last_line(self) -> None:
-        """End a line that an interruption has cut off, so that the next run starts a new one."""
+        """End a line that an interruption has cut off, so that the next run gets its own line."""
         path = self._folder / RUNS
         if path.is_file() and not path.read_bytes().endswith(b"\n"):
             self._write(b"\n")
 
     def _require_all(self, runs: int, kernels: Sequence[str] | None) -> None:
-        """Refuse to leave out existing runs, because the summary covers the whole folder."""
+        """Raise ConfigError if the folder holds runs that this campaign does not include.
+
+        No run may be left out, because the summary covers the whole folder.
+        """
         counts: dict[str, int] = {}
         for entry in read_runs(self._folder):
             kernel = entry.get("kernel", "")
@@ -87,7 +90,7 @@ class Journal:
             )
 
     def runs_of(self, planned: Sequence[FaultRecord]) -> dict[int, FaultRecord]:
-        """Return the existing runs of the planned faults, by number."""
+        """Return the completed runs of the planned faults, keyed by the number of the fault."""
         runs = {}
         for entry in read_runs(self._folder):
             index = entry["run"]
@@ -96,12 +99,12 @@ class Journal:
         return runs
 
     def flush_plan(self, name: str, planned: Iterable[FaultRecord]) -> None:
-        """Write the planned faults to the named file."""
+        """Write the planned faults to the file `name` in the folder, one record per line."""
         text = "".join(json.dumps(entry) + "\n" for entry in planned).encode()
         write_atomically(self._folder / name, lambda file: file.write(text))
 
     def append(self, entry: FaultRecord) -> None:
-        """Append a completed run."""
+        """Append the record of a completed run to `runs.jsonl`."""
         self._write((json.dumps(entry) + "\n").encode())
 
     def _write(self, data: bytes) -> None:
@@ -111,7 +114,7 @@ class Journal:
 
 
 def read_plan(folder: Path) -> Json:
-    """Read the plan of a folder.
+    """Read a campaign's plan from its folder.
 
     Raises:
         RecordError: the folder holds no campaign.
@@ -120,9 +123,9 @@ def read_plan(folder: Path) -> Json:
 
 
 def read_runs(folder: Path) -> list[FaultRecord]:
-    """Read the completed records of a folder; incomplete lines are skipped.
+    """Read the records of the completed runs in a campaign's folder, skipping damaged lines.
 
-    If a run was repeated after the program was rebuilt, the later record counts.
+    If a run was repeated after the program was rebuilt, only its later record is returned.
 
     Raises:
         RecordError: the file cannot be read.

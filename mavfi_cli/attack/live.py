@@ -43,11 +43,12 @@ _LOOK_S, _SEARCH_S = 1e-3, 10.0  # interval of the checks for code in scope, and
 
 
 def mission_strategy(fault: InstructionConfig) -> Strategy:
-    """Return the strategy that draws the fault.
+    """Return the strategy by which a mission draws its instruction-level fault.
 
     Raises:
-        UnknownName: A name does not exist.
-        FaultSpecError: The rule is not repeatable, or conflicts with the fault model.
+        UnknownName: A site, role, field, sampling rule or compatibility mode does not exist.
+        FaultSpecError: The sampling rule is not repeatable, or a compatibility mode is combined
+            with a fault model.
     """
     model = FaultModel.named(
         sites=fault.sites, roles=fault.roles, field=fault.field, bits=fault.bits
@@ -63,7 +64,7 @@ def mission_strategy(fault: InstructionConfig) -> Strategy:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveAttack:
-    """The result of a fault in a process that other code runs."""
+    """The result of one fault in a process that was already running."""
 
     injection: Injection | None  # None: the trigger was not reached, or null injection
     followed: Followed
@@ -84,7 +85,7 @@ def attack_live(
     leave_stopped: bool = False,
     **context: Any,
 ) -> LiveAttack:
-    """Apply one fault in a running process, such as a node of a mission, and let it continue.
+    """Apply one fault in a running process, such as a mission's node, and let the process continue.
 
     The record is written to disk before the process runs to the trigger. The process must be a
     child of the calling one or allow tracing (`PR_SET_PTRACER`). If it dies while it is attached,
@@ -99,8 +100,8 @@ def attack_live(
         context: further entries of the record: kernel, stage, sampling rule, seed, scope.
 
     Raises:
-        TracingForbidden: the operating system refuses.
-        FaultError: the location holds another instruction.
+        TracingForbidden: the operating system does not allow tracing.
+        FaultError: the process holds another instruction at the fault's location.
     """
     tracee = Tracee.attach(pid)
     try:
@@ -138,7 +139,7 @@ def attack_moment(
     repeat: FaultRecord | None = None,
     **context: Any,
 ) -> LiveAttack:
-    """Apply one fault in a running process, at once or soon afterwards, and let it continue.
+    """Apply one fault in a running process, at once or soon after, and let the process continue.
 
     A thread is drawn with probability proportional to the CPU time that it has used, and stopped.
     Under the rule `INSTRUCTION` it is stepped, and the fault strikes the k-th executed instruction
@@ -157,8 +158,8 @@ def attack_moment(
         context: further entries of the record.
 
     Raises:
-        TracingForbidden: the operating system refuses.
-        TargetError: no such process.
+        TracingForbidden: the operating system does not allow tracing.
+        TargetError: the process does not exist.
         UnknownName: the process has no such object or function.
         BuildMismatch: the record comes from another build.
     """
@@ -203,7 +204,7 @@ def attack_moment(
 
 
 def _own_objects(pid: int, image: Image) -> list[str]:
-    """Return the objects of a process, except the interpreter of a Python program."""
+    """Return the names of the objects in a process, except the interpreter of a Python program."""
     program = Path(os.readlink(f"/proc/{pid}/exe")).name
     left_out = ("python", "libpython") if program.startswith("python") else ()
     names = (name for name in image.names if not name.startswith(left_out))
@@ -211,7 +212,10 @@ def _own_objects(pid: int, image: Image) -> list[str]:
 
 
 def _drawn_thread(pid: int, rng: np.random.Generator) -> int:
-    """Draw a thread with probability proportional to its CPU time (proc_pid_schedstat(5))."""
+    """Draw the id of a thread, with probability proportional to the thread's CPU time.
+
+    The CPU times come from proc_pid_schedstat(5).
+    """
     threads = threads_of(pid)
     if not threads:
         return pid
@@ -247,7 +251,11 @@ class _Search:
     _stepped_s: float = 0.0  # excludes system calls, in which the thread waits anyway
 
     def fault(self) -> tuple[InstructionFault | None, str]:
-        """Run the thread to a fault. Return the fault, or None and why there is none."""
+        """Run the thread to the instruction to strike, and draw the fault there.
+
+        Returns:
+            The fault and an empty string, or None and the reason why no fault was drawn.
+        """
         by_steps = self.plan.rule is Rule.INSTRUCTION
         drawn = int(self.rng.integers(MOST_STEPS)) + 1 if by_steps else 0
         reason, count = "it executed no code in scope", 0
@@ -294,7 +302,7 @@ class _Search:
         return False
 
     def _return_address(self) -> int:
-        """Return the word on top of the stack; 0 if it cannot be read."""
+        """Return the word on top of the stack, or 0 if it cannot be read."""
         try:
             return int.from_bytes(self.tracee.memory.read(self.tracee.registers.sp, 8), "little")
         except OSError:

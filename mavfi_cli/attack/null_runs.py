@@ -39,7 +39,8 @@ class NullRuns:
 
     Attributes:
         tasks: the faults whose flips were left out.
-        counting: number of null runs that reached their fault, by name of the counting method.
+        counting: number of null runs that reached the instruction of their fault, keyed by the name
+            of the counting method.
         unused: names of the counting methods that are avoided because they change the output.
     """
 
@@ -49,7 +50,7 @@ class NullRuns:
 
     @property
     def reached(self) -> int:
-        """Number of null runs that reached their fault."""
+        """Number of null runs that reached the instruction of their fault."""
         return sum(self.counting.values())
 
 
@@ -59,7 +60,7 @@ def make_null_runs(
     draw: Callable[[Profiles, int], InstructionFault | None],
     run: Run,
 ) -> tuple[Profiles, NullRuns]:
-    """Make null runs of a target, and drop detours that change its output.
+    """Make null runs of a target, and stop using detours if they change its output.
 
     Args:
         name: the target's name for errors.
@@ -93,7 +94,7 @@ def make_null_runs(
 
 
 def require_golden_again(name: str, null_runs: NullRuns, run: Run, golden_s: float) -> None:
-    """Repeat a null run later, to detect a slow change such as a change of date.
+    """Repeat the first null run, to detect a change over time, such as a change of date.
 
     Args:
         golden_s: end of the golden runs on `time.monotonic`. The null run begins at least a
@@ -119,12 +120,15 @@ class _NullRun:
 
     @property
     def differs(self) -> bool:
-        """Whether it ended differently from the golden run."""
+        """Whether the null run ended differently from the golden run."""
         return self.outcome is not RunOutcome.BENIGN
 
     @property
     def method(self) -> str:
-        """Name of the counting method; if there are several, the one that changes the most code."""
+        """Name of the method that counted the executions up to the fault.
+
+        If several methods did, it is the one that changes the most code.
+        """
         if self.task[1] is None:
             return _TIMER
         return _counting(self.task[1]).value
@@ -138,7 +142,7 @@ def _make(tasks: Sequence[Task], run: Run) -> list[_NullRun]:
 
 
 def _problem(made: Iterable[_NullRun]) -> str:
-    """Explain why no outcome of a target can be judged."""
+    """Explain why no outcome can be judged, with the number of differing null runs per method."""
     methods: dict[str, list[_NullRun]] = defaultdict(list)
     for null_run in made:
         methods[null_run.method].append(null_run)
@@ -155,7 +159,7 @@ def _problem(made: Iterable[_NullRun]) -> str:
 
 
 def _by_turns(faults: Sequence[Task]) -> tuple[Task, ...]:
-    """Choose null runs in rotation among the counting methods, and among the places of each."""
+    """Choose up to `NULL_RUNS` faults, in rotation among counting methods and detour locations."""
     methods: dict[Counting, dict[Location | None, list[Task]]] = {}
     for task in faults:
         stops = _detours(task[1])
@@ -169,12 +173,15 @@ def _in_turn(lists: Iterable[Sequence[Task]]) -> list[Task]:
 
 
 def _detours(fault: InstructionFault | None) -> list[CountedStop]:
-    """Return the stages of a fault's trigger that a detour counts."""
+    """Return the stages of a fault's trigger whose executions a detour counts."""
     stages = () if fault is None else fault.trigger
     return [stage for stage in stages if stage.detour is not None and stage.count >= DETOUR_COST]
 
 
 def _counting(fault: InstructionFault | None) -> Counting:
-    """Return a fault's counting method; if it has several, the one that changes the most code."""
+    """Return the method that counts the executions up to a fault.
+
+    If several methods do, return the one that changes the most code.
+    """
     used = {stage.detour.counting for stage in _detours(fault) if stage.detour is not None}
     return next((method for method in Counting if method in used), Counting.BREAKPOINT)

@@ -29,7 +29,7 @@ class AttackPlace(Protocol):
         """Start a run, and stop it before it executes any code in scope."""
 
     def image(self, tracee: Tracee) -> Image:
-        """Return the memory image of a run."""
+        """Return the memory image of a run's process."""
 
     def scope(self, image: Image) -> Scope:
         """Return the code that faults may hit."""
@@ -40,7 +40,7 @@ class AttackPlace(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Golden:
-    """The output, duration and exit code of a golden run."""
+    """The output, CPU time, duration and exit code of a golden run."""
 
     output: bytes
     cpu_s: float
@@ -50,10 +50,10 @@ class Golden:
 
     @property
     def sha256(self) -> str:
-        """SHA-256 of the output."""
+        """SHA-256 of the output, in hexadecimal."""
         return digest(self.output)
 
 
 def digest(output: bytes) -> str:
-    """Return the SHA-256 of an output."""
+    """Return the SHA-256 of an output, in hexadecimal."""
     return hashlib.sha256(output).hexdigest()

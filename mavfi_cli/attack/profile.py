@@ -94,7 +94,10 @@ class TargetProfile:
 
     @property
     def instructions(self) -> Interval:
-        """Number of executed instructions in scope; estimated if the profile is not complete."""
+        """Number of executed instructions in scope, with a confidence interval.
+
+        It is estimated if the profile is not complete.
+        """
         if self.counted is not None:
             return estimated_total([([self.counted.executed], 1)])
         return estimated_total(
@@ -106,7 +109,7 @@ class TargetProfile:
 
     @property
     def not_reached(self) -> float:
-        """Share of the executed instructions that no stop can reach; they are never drawn."""
+        """Share of executed instructions that are never drawn, because no stop can reach them."""
         return 0.0 if self.counted is None else self.counted.not_reached
 
     def code_at(self, address: int) -> bytes:
@@ -114,7 +117,7 @@ class TargetProfile:
         return _code_of(self.code, address)
 
     def contains(self, addresses: NDArray[np.int64]) -> bool:
-        """Return True if all addresses (n,) are in scope."""
+        """Return True if all `addresses`, an array of shape (n,), are in scope."""
         inside = np.zeros(len(addresses), bool)
         for piece in self.code:
             behind = addresses - piece.start
@@ -122,14 +125,21 @@ class TargetProfile:
         return bool(inside.all())
 
     def locate(self, address: int) -> Location:
-        """Return the location of an address in scope."""
+        """Return the location of an address in scope.
+
+        Raises:
+            ValueError: the address is not in scope.
+        """
         for piece in self.code:
             if 0 <= (at := address - piece.start) < len(piece.data) - _TAIL:
                 return Location(piece.object, piece.offset + at)
         raise ValueError(f"{address:#x} is not in scope")
 
     def window_of(self, record: FaultRecord) -> Window | None:
-        """Return the sampled window of a fault; None if windows were not sampled."""
+        """Return the sampled window that contains the fault of a record.
+
+        Returns None if the fault was not drawn from a sample of windows.
+        """
         first = record["trigger"][0]
         return self._sampled_windows.get((first["object"], first["offset"], first["count"]))
 
@@ -144,7 +154,7 @@ class TargetProfile:
 
     @property
     def sampled(self) -> dict[int, int]:
-        """Number of stepped windows of each incomplete stratum, by the stratum's number."""
+        """Number of stepped windows of each incomplete stratum, keyed by the stratum's number."""
         return {
             number: len(stratum.segments)
             for number, stratum in enumerate(self.strata)
@@ -152,7 +162,7 @@ class TargetProfile:
         }
 
     def draw(self, plan: Strategy, rng: np.random.Generator) -> InstructionFault:
-        """Draw one fault uniformly from the executed instructions."""
+        """Draw one fault uniformly from the executed instructions, by the strategy `plan`."""
         drawn = self.counted or self._drawn_stratum(rng)
         return draw_fault(drawn, plan, rng, code_at=self.code_at, locate=self.locate)
 
@@ -162,7 +172,7 @@ class TargetProfile:
         return self.strata[which]
 
     def after(self, begin: CountedStop) -> TargetProfile:
-        """Return the same profile for a run that must reach `begin` first."""
+        """Return the same profile, with triggers that first run to the stop `begin`."""
 
         def later(stratum: Stratum) -> Stratum:
             segments = (
@@ -173,14 +183,14 @@ class TargetProfile:
         return replace(self, strata=tuple(map(later, self.strata)))
 
     def without(self, methods: Container[Counting]) -> TargetProfile:
-        """Return the same profile, with triggers that use none of these counting methods."""
+        """Return the same profile, with triggers that do not use the counting methods `methods`."""
         strata = self.strata
         if Counting.DETOUR in methods:
             strata = tuple(stratum.without_detours() for stratum in strata)
         return replace(self, strata=strata, counted=self.counted and self.counted.without(methods))
 
     def describe(self) -> str:
-        """Describe the population of faults and how it was sampled."""
+        """Describe the instructions from which faults are drawn, and how they were sampled."""
         if self.complete:
             return f"all {self.executed} executed instructions in scope"
         windows: dict[str, list[int]] = {}
@@ -203,7 +213,7 @@ class TargetProfile:
 
 
 def _code_of(code: Iterable[_ScopeCode], address: int) -> bytes:
-    """Return 16 bytes at an address from pieces of code."""
+    """Return up to 16 bytes of code at `address`; empty if no piece of `code` contains it."""
     for piece in code:
         if 0 <= (at := address - piece.start) < len(piece.data):
             return piece.data[at : at + 16]
@@ -222,10 +232,10 @@ def profile_run(
     watch: Watch | None = None,
     guard: Guard = nullcontext,
 ) -> TargetProfile:
-    """Step a golden run, or a sample of its windows.
+    """Profile a golden run by single-stepping all of it, or a sample of its windows.
 
     Args:
-        markers: instructions in scope that begin windows; empty for the whole run.
+        markers: instructions in scope, each of which begins a window; empty to step the whole run.
         end: an instruction in scope; its first execution ends the profile.
         windows: minimum number of windows of each marker to step, after a pilot of half as many.
         enough: number of instructions to step per marker. The pilot determines how many windows
@@ -259,7 +269,7 @@ def profile_run(
 
 
 def profile_call(place: AttackPlace, *, limit: int = STEPS) -> TargetProfile:
-    """Step one call of the function at which the runs of the place start.
+    """Profile a function by single-stepping one call of it. Runs of `place` start at its entry.
 
     Raises:
         WindowTooLong: the call executes more than `limit` instructions in scope.
@@ -278,7 +288,7 @@ def profile_calls(
     watch: Watch | None = None,
     guard: Guard = nullcontext,
 ) -> TargetProfile:
-    """Step calls of one of the functions, drawn in proportion to its number of calls.
+    """Profile one of the functions, drawn in proportion to its calls, by stepping some calls.
 
     Args:
         windows: largest number of calls to step.
@@ -332,7 +342,7 @@ def profile_counted(
 
 
 def native_time_s(place: AttackPlace, counts: Executions) -> float | None:
-    """Return the CPU time that a native run needs to reach the given counts, s.
+    """Return the CPU time, in seconds, that a native run needs to reach the given counts.
 
     Args:
         counts: execution counts of the first part of the run.
@@ -357,7 +367,11 @@ def native_time_s(place: AttackPlace, counts: Executions) -> float | None:
 def _counted(
     place: AttackPlace, counts: Executions
 ) -> tuple[CountedRun, Image, tuple[_ScopeCode, ...]]:
-    """Map the counts in scope to the addresses of a native run."""
+    """Convert execution counts to the addresses of a native run.
+
+    Returns:
+        The counts of instructions in scope, the memory image of the run, and the code in scope.
+    """
     image, code, scope = _code(place)
     objects = {entry.path: entry.bias for entry in map(image.named, scope.objects) if entry.path}
     # Valgrind names an object only if the object's writable data is mapped from its file. Other
@@ -397,10 +411,10 @@ def _require_counts(
 
 
 def function_of(place: AttackPlace, name: str) -> Location:
-    """Find the entry of a function in scope.
+    """Return the entry of the function `name`, which must be in scope.
 
     Raises:
-        UnknownName: there is no function of that name; the message suggests the nearest one.
+        UnknownName: no function in scope has this name; the message suggests the nearest one.
     """
     with started(place) as tracee:
         image = place.image(tracee)
@@ -408,7 +422,7 @@ def function_of(place: AttackPlace, name: str) -> Location:
 
 
 def detour_of(place: AttackPlace, marker: Location) -> Detour | None:
-    """Return a detour that counts executions of the marker; None if none fits there."""
+    """Return a detour that can count the executions of `marker`, or None if no detour fits."""
     with started(place) as tracee:
         address = place.image(tracee).address(marker)
         code = tracee.memory.read(address, _DETOUR_CODE)
@@ -422,7 +436,7 @@ def detour_of(place: AttackPlace, marker: Location) -> Detour | None:
 
 @contextmanager
 def started(place: AttackPlace) -> Iterator[Tracee]:
-    """Start a run of a place, and kill it afterwards."""
+    """Start a run in `place`, and kill it at the end of the context."""
     tracee = place.start()
     try:
         yield tracee
@@ -472,7 +486,12 @@ class _Stepper:
             return tracee.count_to_end(self.place.image(tracee).address(self.marker))
 
     def step(self, numbers: NDArray[np.int64], count: int) -> Stratum:
-        """Step the windows with these numbers, each from 1 to `count`."""
+        """Step the windows with the given numbers, counted from 1, and return them as a stratum.
+
+        Args:
+            numbers: (n,) numbers of the windows to step.
+            count: number of all windows that the stratum represents.
+        """
         left = sorted(numbers.tolist())
         segments: list[Segment] = []
         while left:  # one pass, unless a function calls itself
@@ -482,7 +501,7 @@ class _Stepper:
         return Stratum(marker=self.marker, segments=tuple(segments), windows_in_run=count)
 
     def _pass(self, numbers: Sequence[int]) -> Iterator[Segment]:
-        """Step windows of one run, up to one that begins inside an earlier window."""
+        """Step windows of one run and yield each. Stop before one that begins inside another."""
         with started(self.place) as tracee, self.guard(tracee):
             image = self.place.image(tracee)
             address = -1 if self.marker is None else image.address(self.marker)

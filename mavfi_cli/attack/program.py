@@ -42,7 +42,7 @@ from mavfi_cli.fi.tracer.tracee import Ended, Mechanism, Tracee
 
 
 def _require_attackable(path: Path) -> None:
-    """Refuse a program that cannot be attacked.
+    """Raise an error if a program cannot be attacked.
 
     Raises:
         TargetError: the program is a script, set-uid or set-gid, or built for another processor.
@@ -74,7 +74,7 @@ _WATCHING = 20.0  # largest slowdown of a run whose system calls are observed
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProgramTarget:
-    """A program, its code in scope, and its compared outputs."""
+    """A program to attack, with its code in scope and the outputs to compare."""
 
     command: Program
     comparison: OutputComparison
@@ -93,16 +93,16 @@ class ProgramTarget:
 
     @property
     def stream(self) -> tuple[str, ...]:
-        """Empty, because a campaign has only one program."""
+        """Name of the random stream: empty, because a campaign has only one program."""
         return ()
 
     @property
     def scope_objects(self) -> tuple[str, ...]:
-        """The objects in scope."""
+        """File names of the objects in scope; by default, only the program itself."""
         return self.objects or (self.name,)
 
     def context(self) -> Json:
-        """Return the entries about the program in every record."""
+        """Return the entries about the program that every record contains."""
         entries: Json = {
             "program": list(self.command.argv),
             "scope": list(self.scope_objects),
@@ -113,7 +113,7 @@ class ProgramTarget:
         return entries
 
     def settings(self) -> Json:
-        """Return everything that determines the results."""
+        """Return all settings that determine the results of the program's runs."""
         entries = self.context() | {
             "comparison": self.comparison.to_json(),
             "environment": dict(self.command.environment),
@@ -125,7 +125,7 @@ class ProgramTarget:
         return entries
 
     def open(self) -> _Workplace:
-        """Create a scratch folder for the program's runs."""
+        """Create a scratch folder for the program's runs, and return the place that uses it."""
         return _Workplace(self)
 
 
@@ -182,7 +182,10 @@ class _Workplace:
         return image.scope(self.target.scope_objects)
 
     def _parts(self) -> dict[str, bytes | None]:
-        """Return the compared outputs of the last run by name; None for an unwritten file."""
+        """Return the last run's outputs to compare, keyed by name.
+
+        The value is None for a file that the run did not write.
+        """
         parts = self.target.comparison.parts(self._folder.path, self._stdout)
         for name in self.target.comparison.files:
             if parts[name] is not None and not self._folder.wrote(name):
@@ -192,11 +195,11 @@ class _Workplace:
     def profile(
         self, rng: np.random.Generator, *, windows: int = 16, watch: Watch | None = None
     ) -> TargetProfile:
-        """Step or count the golden run, or step sampled calls of the target's function.
+        """Profile the golden run: step it, count it, or step some calls of the target's function.
 
         Raises:
             WindowTooLong: the run is too long to be stepped, and valgrind is not installed.
-            UnknownName: no such object or function.
+            UnknownName: the program has no such object or function.
             TargetError: the function is never called, or the counts do not match a native run.
         """
         if (observed := self._observe()).started:
@@ -222,7 +225,7 @@ class _Workplace:
 
     @contextlib.contextmanager
     def _guard(self, tracee: Tracee) -> Iterator[None]:
-        """Give a stepped run a deadline; if the run ends, compare it with the golden run."""
+        """Set a deadline for a stepped run. If the run ends, require the golden run's result."""
         wall_s = self._watching_s + self.limits.profile_steps * _STEP_LIMIT_S
         with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s) as alarm:
             yield
@@ -243,12 +246,16 @@ class _Workplace:
         return profile_counted(self, rng, executions, begun)
 
     def _native_s(self, executions: Executions) -> float | None:
-        """Return the CPU time of a native run up to these counts; callgrind runs meanwhile."""
+        """Return the CPU time, in seconds, of a native run up to the given counts.
+
+        The run has a folder of its own, because callgrind runs meanwhile. Returns None if the time
+        is unknown.
+        """
         with contextlib.closing(self.target.open()) as other:
             return native_time_s(other, executions)
 
     def _require_golden(self, how: str, ended: Ended) -> None:
-        """Refuse a profiled run whose end or output differs from that of the golden run."""
+        """Raise TargetError if a profiled run's end or output differs from the golden run's."""
         golden = self._known_golden()
         if ended.signal is not None:
             unlike = f"it is killed by {signal_name(ended.signal)}"
@@ -268,7 +275,7 @@ class _Workplace:
         return _WATCHING * golden_s + self.limits.wall_grace_s
 
     def _observe(self) -> ObservedRun:
-        """Watch the program's system calls in one fault-free run."""
+        """Watch the program's system calls in one fault-free run, which is made on first use."""
         if self._observed is None:
             tracee = self.start()
             try:
@@ -278,7 +285,7 @@ class _Workplace:
         return self._observed
 
     def fault_free(self) -> Golden:
-        """Run once without a fault, timed from the entry point.
+        """Run the program once without a fault. Its times count from the entry point.
 
         Raises:
             TargetError: the run times out, is killed, lacks memory or a terminal, prints too much,
@@ -303,7 +310,7 @@ class _Workplace:
         return replace(golden, notices=tuple(self._notices(golden.exit_code)))
 
     def _require_sound(self, ended: Ended, parts: Mapping[str, bytes | None]) -> None:
-        """Refuse a golden run that cannot serve as a reference."""
+        """Raise TargetError if a fault-free run failed or has no output that can be compared."""
         problem = self._failure(ended)
         for name, data in parts.items():
             if data is None:
@@ -322,7 +329,7 @@ class _Workplace:
             raise TargetError(self.name, problem)
 
     def _failure(self, ended: Ended) -> str:
-        """Explain why a fault-free run failed; empty if it did not."""
+        """Explain why a fault-free run failed. Return an empty string if it did not fail."""
         if ended.signal == signal.SIGXFSZ:
             return "was stopped after it had written 1 GB"
         if ended.exit_code == 0:
@@ -368,7 +375,7 @@ class _Workplace:
             )
 
     def describe_difference(self, golden: Golden, again: Golden) -> str:
-        """Describe how two fault-free runs differ; empty if they are equal."""
+        """Describe how two fault-free runs differ. Return an empty string if they are equal."""
         if again.exit_code != golden.exit_code:
             return f"their exit codes are {golden.exit_code} and {again.exit_code}"
         if self.target.comparison.same(golden.output, again.output):
@@ -396,7 +403,7 @@ class _Workplace:
 
 
 def _joined(parts: dict[str, bytes | None]) -> bytes:
-    """Join all outputs; if there are several, precede each with its name."""
+    """Join all outputs. If there are several, each is preceded by a line with its name."""
     pieces = [b"\0missing" if data is None else data for data in parts.values()]
     if len(pieces) == 1:
         return pieces[0]

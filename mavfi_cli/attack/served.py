@@ -38,10 +38,11 @@ _early: dict[str, ServedProcess] = {}
 
 
 class ServedProcess:
-    """A started program. Loading may take a long time, so start it early.
+    """A Python program that runs in a process of its own and answers messages over a socket.
 
-    A program that compiles its modules has a different memory layout from one that loads their
-    bytecode. So a program that wrote to a cache is replaced by another, which loads from it.
+    Loading the program may take a long time, so start it early. A program that compiles its modules
+    has a different memory layout from one that loads their bytecode. So a program that wrote to a
+    cache is replaced by another, which loads from it.
 
     Attributes:
         pid: its process id.
@@ -60,13 +61,13 @@ class ServedProcess:
 
     @classmethod
     def start_early(cls, module: str) -> None:
-        """Start a slow program now; the next call of `of` returns it."""
+        """Start the program `module` now, because loading is slow. The next `of` returns it."""
         if module not in _early:
             _early[module] = cls(module)
 
     @classmethod
     def of(cls, module: str) -> ServedProcess:
-        """Return the program that was started early, or start a new one."""
+        """Return the program `module` that was started early, or else start it now."""
         return _early.pop(module, None) or cls(module)
 
     def _start(self) -> None:
@@ -110,7 +111,7 @@ class ServedProcess:
         return answer
 
     def last_error(self) -> str:
-        """Return the last line that the program wrote to its standard error."""
+        """Return the last line that the program wrote to standard error, or else a default text."""
         lines = os.pread(self._errors, 1 << 20, 0).decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else "its process ended"
 

@@ -33,13 +33,13 @@ class RunOutcome(Enum):
 
     @property
     def title(self) -> str:
-        """The name in tables."""
+        """The name of the outcome in tables."""
         return "SDC" if self is RunOutcome.SDC else self.value.replace("_", " ")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunLimits:
-    """The limits beyond which a run counts as hung, and the limits of stepping."""
+    """The limits beyond which a run counts as hung, and the limits of single-stepping."""
 
     factor: float = 10.0  # multiple of the golden CPU time and duration
     cpu_grace_s: float = 1.0
@@ -51,7 +51,7 @@ class RunLimits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunVerdict:
-    """The verdict on a run, from how it ended and from its output.
+    """The verdict on a run, which depends on how the run ended and on its output.
 
     Attributes:
         outcome: the outcome, if the flip was applied.
@@ -72,47 +72,47 @@ class JudgedPlace(AttackPlace, Protocol):
         """The limits beyond which a run counts as hung."""
 
     def context(self) -> Json:
-        """Return the entries about the target in every record."""
+        """Return the entries about the target that every record contains."""
 
     def profile(self, rng: np.random.Generator, *, windows: int, watch: Watch) -> TargetProfile:
-        """Step the golden run, or a sample of it."""
+        """Step the golden run, or a sample of it, and return the instructions that it executes."""
 
     def fault_free(self) -> Golden:
-        """Run once without a fault.
+        """Run the target once without a fault, and return its output and times.
 
         Raises:
             TargetError: the run fails.
         """
 
     def describe_difference(self, golden: Golden, again: Golden) -> str:
-        """Describe how two fault-free runs differ; empty if they are equal."""
+        """Describe how two fault-free runs differ. Return an empty string if they are equal."""
 
     def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
-        """Judge the last run; `ended` is None if it exceeded its limit."""
+        """Judge the last run. `ended` is None if the run exceeded its limit."""
 
 
 def places_of(place: JudgedPlace) -> Sequence[JudgedPlace]:
-    """Return one place per input of a target: its attribute `inputs`, or the place itself."""
+    """Return one place for each input of a target: `place.inputs` if it exists, or else `place`."""
     inputs: Sequence[JudgedPlace] = getattr(place, "inputs", (place,))
     return inputs
 
 
 class AttackTarget(Protocol):
-    """A target as plain values."""
+    """A program or kernel to attack, as plain values that can be sent to a worker process."""
 
     @property
     def name(self) -> str:
-        """The target's name in progress and errors."""
+        """The target's name in progress reports and error messages."""
 
     @property
     def stream(self) -> tuple[str, ...]:
-        """Name of its random stream; empty if it is the only target of a campaign."""
+        """Name of the target's random stream; empty if a campaign has no other target."""
 
     def settings(self) -> Json:
-        """Return what determines its results; the same for all targets of a campaign."""
+        """Return the settings that determine the results. All targets of a campaign share them."""
 
     def open(self) -> JudgedPlace:
-        """Open a place for runs in this process."""
+        """Open a place in which this process can run the target."""
 
 
 def judged(
@@ -123,13 +123,17 @@ def judged(
     *,
     tolerance: float | None,
 ) -> tuple[RunOutcome, Difference | None]:
-    """Return the outcome of a run, and its difference from the golden run if known.
+    """Return the outcome of a run, and how its output differs from that of the golden run.
 
     Args:
         ended: how the run ended; None if it exceeded its limit.
-        output: its output; None if incomplete.
-        compare: returns the difference between the golden and another output, or None.
+        output: the output of the run; None if it is incomplete.
+        compare: returns the difference between the golden output and another one, or None if they
+            cannot be compared.
         tolerance: largest relative difference that is benign; None if every byte counts.
+
+    Returns:
+        The difference is None if the run hung or crashed, or if `compare` returns None.
     """
     if ended is None:
         return RunOutcome.HANG, None

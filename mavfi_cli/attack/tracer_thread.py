@@ -23,7 +23,8 @@ class TracerThread(Generic[T]):
     """A separate thread that works on a traced node.
 
     Args:
-        work: receives a function to call once the node runs towards the awaited event.
+        work: the work of the thread. It receives a function that it must call once the node runs
+            towards the awaited event.
     """
 
     def __init__(self, work: Callable[[Notice], T]) -> None:
@@ -40,18 +41,18 @@ class TracerThread(Generic[T]):
         threading.Thread(target=run, daemon=True).start()
 
     def await_armed(self) -> None:
-        """Wait until the node runs towards the awaited event; raise any earlier error."""
+        """Wait until the node runs towards the awaited event, or raise the error of the work."""
         self._armed.wait()
         if self._done.done():
             self._done.result()
 
     @property
     def done(self) -> bool:
-        """True once the work is done."""
+        """True once the work has ended, even with an error."""
         return self._done.done()
 
     def result(self) -> T:
-        """Wait until the work is done; return its result or raise its error."""
+        """Wait until the work has ended, then return its result or raise its error."""
         return self._done.result()
 
 
@@ -80,7 +81,7 @@ class EntryCounter:
         return self._stops if self._counter is None else self._counter.read()
 
     def close(self) -> None:
-        """Remove the counter, and end the node if it had to be traced."""
+        """Remove the counter. If counting required tracing the node, end the node too."""
         if self._counter is not None:
             self._counter.close()
         if self._tracer is not None:

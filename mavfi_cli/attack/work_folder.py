@@ -52,7 +52,10 @@ def copied_arguments(
 
 
 def _copied(argument: str, directory: Path, folder: Path | None) -> tuple[str, Path | None]:
-    """Return the name of an argument's copy, and its source if that is outside `folder`."""
+    """Return the argument with the name of the copy, and the file or folder to copy.
+
+    The latter is None if nothing outside `folder` has to be copied.
+    """
     # Unlike Path, the functions of os.path accept text of any length.
     path, absolute = os.path.join(directory, argument), os.path.isabs(argument)
     named = os.path.isfile(path) or ("/" in argument and os.path.isdir(path))
@@ -90,7 +93,7 @@ class WorkFolder:
         scratch: A scratch folder, in which the copies are made.
         folder: The folder whose contents are copied; None for an empty folder.
         sources: Further files and folders, by their path relative to the program's folder.
-        name: The program's name for errors.
+        name: The program's name in error messages.
 
     Attributes:
         path: The program's folder.
@@ -123,7 +126,7 @@ class WorkFolder:
         """Restore the folder to its state before the first run.
 
         Raises:
-            TargetError: It cannot be restored.
+            TargetError: The folder cannot be restored.
         """
         try:
             if self.tree.exists():
@@ -134,11 +137,11 @@ class WorkFolder:
             raise TargetError(self._name, problem) from None
 
     def had(self, name: str) -> bool:
-        """Return True if a file was in the folder before the run."""
+        """Return True if the file `name` was in the folder before the run."""
         return (self._copy / name).is_file()
 
     def wrote(self, name: str) -> bool:
-        """Return True if the last run created or wrote a file that now exists in the folder."""
+        """Return True if the last run created or wrote to the file `name`, which must exist now."""
         before, after = self._copy / name, self.path / name
         if not before.is_file():
             return True

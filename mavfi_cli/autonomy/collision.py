@@ -34,7 +34,7 @@ FASTEST_MPS = 100.0  # a faster vehicle would leave the map within one waypoint'
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CollisionParams:
-    """Size of the vehicle and sample spacing of the check.
+    """Parameters of the collision check, such as the size of the vehicle and the sample spacing.
 
     The radius is the body's half diagonal (about 0.3 m for `solo`) plus a margin for tracking
     error, depth quantisation (0.1 m) and half a voxel. MAVBench uses a box of 1.5 m.
@@ -50,7 +50,7 @@ class CollisionParams:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CollisionState:
-    """State of the check between two calls."""
+    """The state that the collision check keeps from one call of `step` to the next."""
 
     future_collision_seq: int = 0
     foreseen_on_seq: int | None = None  # trajectory on which a collision is predicted
@@ -58,7 +58,7 @@ class CollisionState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CollisionInputs:
-    """Input messages of one call."""
+    """The inputs of one call of `step`."""
 
     stamp_s: float
     snapshot: MapSnapshot
@@ -70,7 +70,7 @@ class CollisionInputs:
 def step(
     state: CollisionState, inputs: CollisionInputs, params: CollisionParams
 ) -> tuple[CollisionState, CollisionReport]:
-    """Check the rest of the trajectory.
+    """Check the rest of the trajectory for collisions. Return the new state and the report.
 
     The report's time_to_collision_s is the time from `inputs.time_s` along the trajectory to the
     first contact, or inf if there is none. future_collision_seq increases by one when the check
@@ -105,9 +105,10 @@ def step(
 def _time_to_collision(
     snapshot: MapSnapshot, trajectory: Trajectory, time_s: float, params: CollisionParams
 ) -> float:
-    """Return the time from `time_s` along the trajectory to the first contact, s; inf if free.
+    """Return the time in seconds from `time_s` along the trajectory to the first contact.
 
-    The result is never late. It is early by at most the time for one or two sample spacings.
+    The time is infinite if the trajectory is free. It is never late, and it is early by at most the
+    time for one or two sample spacings.
     """
     farthest_m = params.farthest_m
     if not params.refuses_far_waypoints:
@@ -196,7 +197,7 @@ class _SphereProbe:
 def _first_contact(
     snapshot: MapSnapshot, points: FloatArray, params: CollisionParams
 ) -> int | None:
-    """Return the index of the first of the points (n, 3) in contact, or None.
+    """Return the index of the first of `points` (n, 3) that is in contact, or None if none is.
 
     A vehicle that is already within the radius of an obstacle may leave it: until a point is free
     at full radius, points within two radii of the start are tested with the body's radius only.
@@ -227,13 +228,15 @@ def _sample_ahead(
     points: FloatArray,
     times_s: FloatArray,
 ) -> tuple[int, float]:
-    """Sample the remaining reference at most `spacing_m` apart, with the time of each point.
+    """Sample the rest of the reference at points that are at most `spacing_m` apart.
 
-    A straight line bridges a gap between the end of one waypoint's motion and the next waypoint.
-    Every loop is bounded by the number of waypoints, by MAX_SAMPLES_A_PIECE or by `points`.
+    The points and their times are written to `points` and `times_s`. A straight line bridges a gap
+    between the end of one waypoint's motion and the next waypoint. Every loop is bounded by the
+    number of waypoints, by MAX_SAMPLES_A_PIECE or by `points`.
 
     Returns:
-        Number of samples written, and the time of the first unflyable point (inf if none).
+        The number of samples written, and the time of the first point that cannot be flown, or
+        infinity if all can.
     """
     current, elapsed = locate(durations_s, time_s)
     count, now = 0, 0.0
@@ -266,7 +269,10 @@ def _sample_ahead(
 
 @compiled
 def _pieces(length_m: float, spacing_m: float) -> int:
-    """Return how many pieces of at most `spacing_m` a length has, up to MAX_SAMPLES_A_PIECE."""
+    """Return the number of pieces, at most `spacing_m` long, into which a length is divided.
+
+    The number is limited to MAX_SAMPLES_A_PIECE.
+    """
     wanted = length_m / spacing_m
     if not wanted < MAX_SAMPLES_A_PIECE:
         return MAX_SAMPLES_A_PIECE
@@ -290,7 +296,10 @@ def _bridge(
     at_s: float,
     spacing_m: float,
 ) -> int:
-    """Append a point, and intermediate points if the last one is far away. Return the new count."""
+    """Append the point (x, y, z) to `points`, and return the new number of points.
+
+    If the last point is far away, intermediate points are appended first.
+    """
     pieces = 1
     if count > 0:
         last = points[count - 1]

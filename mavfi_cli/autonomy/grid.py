@@ -80,7 +80,7 @@ class ObstacleGrid:
 
     @property
     def arguments(self) -> tuple[Blocked, FloatArray, float, FloatArray]:
-        """First arguments of `segment_free` and `path_free`."""
+        """The grid in the form of the first four arguments of `segment_free` and `path_free`."""
         return self.blocked, self.origin_enu_m, self.resolution_m, self.bounds_enu_m
 
     def point_free(self, point_enu_m: FloatArray) -> bool:
@@ -117,10 +117,10 @@ def _extent(
 
 
 def _run_half_widths(radius_m: float, resolution_m: float) -> NDArray[np.int64]:
-    """Return the dilation's reach in z, in voxels, for each column offset (dx, dy), (w, w).
+    """Return how many voxels the dilation reaches in z, for each column offset (dx, dy).
 
-    The reach is -1 for a column that the dilation misses. An offset of k between two voxels leaves
-    a gap of max(|k| - 1, 0) voxels between them.
+    The result is an array (w, w). It is -1 for a column that the dilation misses. An offset of k
+    between two voxels leaves a gap of max(|k| - 1, 0) voxels between them.
     """
     reach = math.ceil(radius_m / resolution_m) + 1
     offsets = np.abs(np.arange(-reach, reach + 1))
@@ -145,9 +145,10 @@ def _rasterise(leaves: NDArray[np.int64], low: NDArray[np.int64], occupied: Bloc
 
 @compiled
 def _dilate(occupied: Blocked, widths: NDArray[np.int64], blocked: Blocked) -> None:
-    """Dilate each run of occupied voxels along z into the neighbouring columns.
+    """Mark the voxels within reach of an occupied voxel as blocked.
 
-    Walls are upright, so a run covers a whole column, which would be many single voxels.
+    Each run of occupied voxels along z is dilated into the neighbouring columns as a whole. Walls
+    are upright, so a run covers a whole column, which would be many single voxels.
     """
     nx, ny, nz = occupied.shape
     reach = widths.shape[0] // 2

@@ -55,11 +55,11 @@ class MinimumSnap:
         a_max_mps2: float,
         passes_max: int,
     ) -> Self:
-        """Find the curve along a free path (n, 3), from a velocity (3,) at its start to rest.
+        """Fit a curve to a free path (n, 3). It begins with a velocity (3,) and ends at rest.
 
         Args:
-            is_free: returns True if a polyline (k, 3) lies in free space.
-            passes_max: maximum number of passes; each pass after the first adds a vertex.
+            is_free: Returns True if a polyline (k, 3) lies in free space.
+            passes_max: Maximum number of passes. Each pass after the first adds a vertex.
         """
         vertices = _distinct(path_enu_m)
         for _ in range(passes_max):
@@ -73,7 +73,10 @@ class MinimumSnap:
         return cls(durations_s=durations_s, coefficients=coefficients, free=blocked is None)
 
     def sampled(self, period_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Sample position, velocity and acceleration, (k, 3) each, every `period_s` from time 0."""
+        """Return position, velocity and acceleration, each (k, 3), every `period_s` seconds.
+
+        The first sample is at time 0.
+        """
         count = max(1, math.floor(float(self.durations_s.sum()) / period_s))
         times_s = np.arange(count, dtype=np.float64) * period_s
         position, velocity, acceleration = (
@@ -92,7 +95,7 @@ def _distinct(path: FloatArray) -> FloatArray:
 
 
 def _segment_durations(vertices: FloatArray, v_max_mps: float, a_max_mps2: float) -> FloatArray:
-    """Return the duration of each segment (n - 1,) between the vertices (n, 3), s."""
+    """Return the duration in seconds of each segment (n - 1,) between the vertices (n, 3)."""
     durations_s = []
     for start, end in itertools.pairwise(vertices):
         direct_s = 2.0 * max(norm(end - start), 1e-3) / v_max_mps
@@ -174,7 +177,7 @@ def _eliminate(matrix: FloatArray, right: FloatArray) -> None:
 def _evaluate(
     spline: FloatArray, durations_s: FloatArray, times_s: FloatArray, order: int
 ) -> FloatArray:
-    """Return the derivative (k, 3) of that order at the times (k,); order 0 is the position."""
+    """Return the `order`-th derivative (k, 3) of the curve at the times (k,). 0 is the position."""
     ends_s = np.cumsum(durations_s)
     index = np.minimum(np.searchsorted(ends_s, times_s, side="right"), len(ends_s) - 1)
     lengths_s = durations_s[index][:, None]
@@ -190,7 +193,7 @@ def _evaluate(
 def _first_blocked(
     spline: FloatArray, durations_s: FloatArray, is_free: Callable[[FloatArray], bool]
 ) -> int | None:
-    """Return the index of the first segment that is not free; None if all are free."""
+    """Return the index of the first segment that is not free, or None if all are free."""
     for segment, duration_s in enumerate(durations_s.tolist()):
         within_s = np.append(np.arange(0.0, duration_s, _CHECK_STEP_S), duration_s)
         alone = spline[segment : segment + 1], durations_s[segment : segment + 1]

@@ -128,7 +128,10 @@ class OccupancyMap:
         return np.ascontiguousarray(points if kept.all() else points[kept])
 
     def _in_range(self, coordinates: FloatArray) -> NDArray[np.bool_]:
-        """Return True for each coordinate over two ray lengths inside the octree; False for NaN."""
+        """Return, for each coordinate, True if it is more than two ray lengths inside the octree.
+
+        NaN gives False.
+        """
         limit = HALF_RANGE * self._params.resolution_m - 2.0 * self._params.max_range_m
         return np.abs(coordinates) < limit
 
@@ -151,14 +154,14 @@ class OccupancyMap:
 
 
 def _codes_of(points: FloatArray, resolution_m: float) -> Codes:
-    """Return the voxel codes of points (n, 3), leaving out points that have none."""
+    """Return the codes of the voxels that contain the points (n, 3). Omit points without a code."""
     codes = np.empty(len(points), np.int64)
     return codes[: _morton_codes(np.asarray(points, np.float64), resolution_m, codes)]
 
 
 @compiled
 def _morton_codes(points: FloatArray, resolution: float, codes: Codes) -> int:
-    """Write the voxel codes of points (n, 3) and return how many were written.
+    """Write the voxel codes of points (n, 3) to `codes`, and return how many were written.
 
     Points that are not finite or outside the octree's range have no code. Coordinates are rounded
     to single precision first, as in OctoMap.
@@ -183,7 +186,7 @@ def _morton_codes(points: FloatArray, resolution: float, codes: Codes) -> int:
 
 @compiled
 def _voxel_centres(codes: Codes, resolution: float, centres: FloatArray) -> None:
-    """Write the centres (n, 3), m, of the voxels with the given codes (n,)."""
+    """Write to `centres` (n, 3) the centres, in metres, of the voxels with the codes (n,)."""
     for i in range(codes.shape[0]):
         for axis in range(3):
             index = 0
@@ -193,9 +196,10 @@ def _voxel_centres(codes: Codes, resolution: float, centres: FloatArray) -> None
 
 
 def _stream_of(codes: Codes) -> bytes:
-    """Encode a tree in which exactly these voxels are occupied and all others unknown.
+    """Return the node stream of a tree in which only the given voxels are occupied.
 
-    `codes` (n,) must be sorted and distinct. A fully occupied cube becomes one leaf.
+    All other voxels are unknown. `codes` (n,) must be sorted and distinct. A fully occupied cube
+    becomes one leaf.
     """
     if not len(codes):
         return b""

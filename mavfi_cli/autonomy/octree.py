@@ -20,9 +20,9 @@ HALF_RANGE = 1 << (TREE_DEPTH - 1)
 
 
 def occupied_leaves(stream: bytes) -> NDArray[np.int64]:
-    """Decode the occupied cubes of a node stream as voxel indices (n, 4): lower corner x y z, size.
+    """Return the occupied cubes of a node stream, (n, 4): the lower corner x y z, and the size.
 
-    A truncated or invalid stream gives the leaves up to the error.
+    The unit is one voxel. A truncated or invalid stream gives the cubes up to the error.
     """
     # A two-byte node has at most eight leaves.
     leaves = np.empty((4 * len(stream), 4), np.int64)
@@ -32,7 +32,7 @@ def occupied_leaves(stream: bytes) -> NDArray[np.int64]:
 
 @compiled
 def decode_leaves(stream: NDArray[np.uint8], leaves: NDArray[np.int64]) -> int:
-    """Fill `leaves` from the node stream and return their number."""
+    """Write the occupied cubes of a node stream to `leaves`, and return how many there are."""
     stack = np.empty((8 * TREE_DEPTH + 8, 4), np.int64)  # x y z of the lower corner, size
     stack[0, 0], stack[0, 1], stack[0, 2] = -HALF_RANGE, -HALF_RANGE, -HALF_RANGE
     stack[0, 3] = 2 * HALF_RANGE

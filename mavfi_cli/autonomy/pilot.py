@@ -30,7 +30,7 @@ from mavfi_cli.core.types import (
 
 
 class PilotMode(Enum):
-    """Mode of the pilot."""
+    """The mode of the pilot, which states what the vehicle is doing now."""
 
     TURNING = "turning"  # hovers and makes one full turn before the first plan
     WAITING = "waiting"  # hovers and waits for a plan
@@ -58,7 +58,7 @@ class PlanRequest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanFailure:
-    """Report that the planner found no trajectory."""
+    """The planner's report that it found no trajectory."""
 
     stamp_s: float  # requested start of the trajectory
     reason: str
@@ -72,7 +72,7 @@ TURN_S = 6.0  # duration of one full turn; as in the released code with its two 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PilotParams:
-    """Limits and time-outs of the mission.
+    """Limits, time-outs and rules by which the pilot flies a mission.
 
     v_max, a_max, the 0.25 s planning lead and the 40 attempts are those of the released
     package_delivery application (MAVBench/MAV_apps, branch mavfi).
@@ -133,12 +133,12 @@ class _ActivePlan:
         self.begin(None, time_s=0.0, rate=0.0)
 
     def begin(self, trajectory: Trajectory | None, *, time_s: float, rate: float) -> None:
-        """Follow a trajectory from `time_s`, with its clock at `rate`."""
+        """Follow a trajectory, starting at its time `time_s`, with its clock at `rate`."""
         self.trajectory, self.time_s, self.rate = trajectory, time_s, rate
         self.rate_change_per_s, self.pace = 0.0, 1.0
 
     def advance(self, step_s: float, target_rate: float) -> None:
-        """Advance the clock by a step and ramp its rate towards the target."""
+        """Advance the clock by `step_s` seconds, and ramp its rate towards `target_rate`."""
         speed = max(self._planned_speed_mps(), SPEED_MIN_MPS)
         ramp = self._params.brake_mps2 / speed * step_s
         change = min(max(target_rate - self.rate, -ramp), ramp)
@@ -148,30 +148,30 @@ class _ActivePlan:
         self.time_s += 0.5 * (before + self.rate) * step_s * self.pace
 
     def exchange(self, flown: Trajectory, changed: Trajectory) -> None:
-        """Replace a trajectory with a changed version, without a new collision check."""
+        """Replace `flown`, if it is active, with `changed`, without a new collision check."""
         if self.trajectory is flown:
             self.trajectory = changed
         if self.checked is flown:
             self.checked = changed
 
     def skip_waypoint(self) -> None:
-        """Skip to the next waypoint, or to the end if there is none."""
+        """Skip to the next waypoint, or to the end of the trajectory if there is none."""
         if self.trajectory is not None:
             durations_s = self.trajectory.durations_s[: self.waypoint + 1]
             self.time_s = float(durations_s[durations_s > 0.0].sum())
 
     @property
     def over(self) -> bool:
-        """True if there is no trajectory, or if its end has passed; NaN counts as passed."""
+        """True if there is no trajectory, or if its end has passed. A NaN time counts as passed."""
         return self.trajectory is None or not self.time_s < self.trajectory.duration_s
 
     @property
     def waypoint(self) -> int:
-        """Index of the current waypoint; 0 without a trajectory."""
+        """Index of the current waypoint, or 0 without a trajectory."""
         return 0 if self.trajectory is None else self.waypoint_at(self.trajectory, self.time_s)
 
     def waypoint_at(self, trajectory: Trajectory, time_s: float) -> int:
-        """Return the index of a trajectory's waypoint at a time. The latest result is cached."""
+        """Return the index of a trajectory's waypoint at `time_s`. The latest result is cached."""
         known, known_s, index = self._located
         if trajectory is not known or time_s != known_s:
             index = waypoint_index(trajectory, time_s)
@@ -192,7 +192,7 @@ class _ActivePlan:
         return min(speed, limit) if math.isfinite(speed) else limit
 
     def stopping_s(self) -> float:
-        """Return the time to brake from the current speed to rest, s."""
+        """Return the time in seconds to brake from the current speed to rest."""
         return self.rate * self._planned_speed_mps() / self._params.brake_mps2
 
 
@@ -228,7 +228,7 @@ class Pilot:
 
     @np.errstate(over="ignore", invalid="ignore")
     def on_report(self, report: CollisionReport) -> bool:
-        """Handle a report of the collision check. Return True if its time to collision was read.
+        """Handle a collision report. Return True if the pilot read its time to collision.
 
         A report whose future_collision_seq is lower than the newest one is ignored.
         """
@@ -250,7 +250,7 @@ class Pilot:
         return self.params.uses_time_to_collision
 
     def holds(self, trajectory: object) -> bool:
-        """Return True if this trajectory is active or next."""
+        """Return True if this trajectory is the active one, or the next one to follow."""
         return trajectory is not None and (
             trajectory is self.active.trajectory or trajectory is self._next
         )
@@ -341,7 +341,7 @@ class Pilot:
         self.plan_lost()
 
     def plan_lost(self) -> None:
-        """Request another plan if one is pending, because that one will not arrive."""
+        """Request another plan if one is pending, because the pending one will not arrive."""
         if self._awaiting_plan:
             self._awaiting_plan = False
             self._wanted = True
@@ -373,7 +373,7 @@ class Pilot:
         """Run one control tick: advance along the trajectory and return what to track.
 
         Returns:
-            The inputs of control, and a request if a plan is needed.
+            The inputs of control, and a request if a plan is needed, otherwise None.
         """
         step_s = stamp_s - self._stamp_s if self._stamp_s else 0.0
         self._stamp_s = stamp_s
@@ -416,7 +416,7 @@ class Pilot:
 
     @property
     def _look_s(self) -> float:
-        """Time since the vehicle began its full turn, s; 0 without one."""
+        """Time in seconds since the vehicle began its full turn, or 0 if it is not turning."""
         return 0.0 if self._look_started_s is None else self._stamp_s - self._look_started_s
 
     def _has_arrived(self, state: VehicleState) -> bool:
@@ -518,7 +518,11 @@ class Pilot:
         self._hold_yaw = state.yaw_rad
 
     def _plan_request(self, state: VehicleState) -> PlanRequest | None:
-        """Return a request if one is due, none is pending, and the pause is over."""
+        """Return a request for a plan, or None if no request is due.
+
+        A request is due if a plan is wanted, none is pending, the pause is over and the mode allows
+        planning.
+        """
         idle = self.mode in (*_DONE, PilotMode.STOPPING, PilotMode.TURNING)
         if not self.params.plans_in_motion:
             idle = idle or self.active.trajectory is not None or not self._at_rest(state)

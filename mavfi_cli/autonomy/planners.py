@@ -91,7 +91,7 @@ class PlanningProblem:
         return cls(start_enu_m=start, goal_enu_m=goal, grid=grid)
 
     def refused(self) -> PlanResult | None:
-        """Return a failure if start or goal is blocked, else None."""
+        """Return a failure if the start or the goal is blocked, or None if both are free."""
         for place, name in ((self.start_enu_m, "start"), (self.goal_enu_m, "goal")):
             if not self.grid.point_free(place):
                 distance_m = math.dist(self.goal_enu_m, self.start_enu_m)
@@ -101,7 +101,7 @@ class PlanningProblem:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanResult:
-    """A path or a failure. A path that ends short of the goal is a failure."""
+    """The result of a search: a path or a failure. A path short of the goal is a failure."""
 
     found: bool
     path_enu_m: FloatArray  # (n, 3) from start to goal; (0, 3) if none was found
@@ -138,7 +138,7 @@ def plan(
     seed: int,
     params: PlanningParams,
 ) -> Trajectory | PlanFailure:
-    """Plan from the request's position to its goal.
+    """Plan a trajectory from the request's position to its goal. Return it, or a failure.
 
     If the vehicle is moving and cannot stop in free space, the plan fails, because the vehicle
     must brake first.
@@ -199,9 +199,9 @@ class _Search:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _OmplPlanner:
-    """One of OMPL's planners. It runs its searches in order until one returns a path.
+    """One of OMPL's planners. It runs its searches in order until one of them finds a path.
 
-    If the straight line from start to goal is free, it is the path.
+    If the straight line from start to goal is free, that line is the path.
     """
 
     name: str
@@ -248,7 +248,10 @@ class _OmplPlanner:
 
 
 class _GridMotions(ob.MotionValidator):  # type: ignore[misc]
-    """Segment test on the obstacle grid. Holds no reference to OMPL objects."""
+    """OMPL's motion validator, which tests straight segments on the obstacle grid.
+
+    It holds no reference to OMPL objects.
+    """
 
     def __init__(self, information: Any, grid: ObstacleGrid) -> None:
         super().__init__(information)
@@ -318,7 +321,7 @@ PLANNERS = PlugIns("mavfi.planners", "planner", OUR_PLANNERS)
 
 
 def find(name: str) -> Planner:
-    """Return the planner of that name with its default settings.
+    """Return the planner called `name`, with its default settings.
 
     Names of our own planners may be spelt differently; see `canonical_planner`.
 

@@ -36,7 +36,7 @@ class PointCloudParams:
 
 
 def generate(frame: DepthFrame, params: PointCloudParams) -> PointCloud:
-    """Compute the world points of a depth image.
+    """Convert a depth image to a point cloud in the world frame.
 
     Pixels that are NaN, negative, zero or -inf are dropped. Pixels that are +inf (nothing in range)
     or beyond the range become clearing rays that end outside `max_range_m`.
@@ -75,7 +75,7 @@ def back_project(
     """Write the world points of `depth_m` (rows, columns) into `points` (rows * columns, 3).
 
     Returns:
-        Number of rows of `points` that were written.
+        The number of rows of `points` that were written.
     """
     rows, columns = depth_m.shape
     offset = free_stride // 2

@@ -65,7 +65,7 @@ class SmoothingParams:
 
     @property
     def acceleration_mps2(self) -> float:
-        """Return the acceleration of the planned motion."""
+        """The acceleration of the planned motion, which is a share of the limit `a_max_mps2`."""
         return self.acceleration_share * self.a_max_mps2
 
 
@@ -124,7 +124,7 @@ def smooth_as_released(
 
 
 def _cut(velocity: FloatArray, limit: float) -> FloatArray:
-    """Limit a velocity (3,). Return zero if it is negligible or not finite."""
+    """Limit the speed of a velocity (3,). Return zero if it is negligible or not finite."""
     velocity = np.asarray(velocity, np.float64)
     largest = float(np.abs(velocity).max())
     if not np.isfinite(velocity).all() or largest == 0.0:
@@ -138,7 +138,7 @@ def _cut(velocity: FloatArray, limit: float) -> FloatArray:
 def _with_run_out(
     path: FloatArray, velocity: FloatArray, grid: ObstacleGrid, params: SmoothingParams
 ) -> tuple[FloatArray, bool]:
-    """Return the vertices to fly, and True if the straight run-out from the start is free.
+    """Return the vertices (m, 3) to fly, and True if the straight run-out from the start is free.
 
     A vehicle in motion runs straight on for half a sample, then brakes to a stop. From there the
     path leads to the farthest path vertex in line of sight, or back to the start of the path if
@@ -158,7 +158,7 @@ def _with_run_out(
 
 
 class _Polyline:
-    """Geometry of a path (n, 3) without points within 1 mm of their predecessor."""
+    """The geometry of a path (n, 3). Points within 1 mm of their predecessor are dropped."""
 
     def __init__(self, path: FloatArray, params: SmoothingParams) -> None:
         kept = [path[0]]
@@ -183,10 +183,10 @@ class _Polyline:
 def _squared_corner_speeds(
     line: _Polyline, start_speed_mps: float, caps: FloatArray, a: float
 ) -> FloatArray:
-    """Return the highest squared speeds at the vertices (n,) that caps and lengths allow.
+    """Return the highest squared speed that caps and segment lengths allow at each vertex (n,).
 
-    The motion begins at the start speed and ends at rest. `caps` (n,) are squared speeds. The first
-    segment must be long enough to stop from the start speed.
+    The motion begins at the start speed and ends at rest. `caps` (n,) are squared speeds, `a` is an
+    acceleration. The first segment must be long enough to stop from the start speed.
     """
     lengths, sines = line.lengths, line.half_sines
     last = len(lengths)
@@ -212,14 +212,17 @@ def _squared_corner_speeds(
 
 
 def _reachable(q_from: float, sine_from: float, sine_to: float, length: float, a: float) -> float:
-    """Return the largest squared speed at one end of a segment, given that at the other end."""
+    """Return the largest squared speed at one end of a segment, given `q_from` at the other end."""
     return max(0.0, (q_from * (1.0 - 2.0 * sine_from) + 2.0 * a * length) / (1.0 + 2.0 * sine_to))
 
 
 def _dwells(
     directions: FloatArray, q: FloatArray, yaw_rad: float, params: SmoothingParams
 ) -> FloatArray:
-    """Return the waiting time at each vertex (n,), s, including the time to turn at rest."""
+    """Return the waiting time in seconds at each vertex (n,), including time to turn at rest.
+
+    `q` (n,) are the squared speeds at the vertices.
+    """
     dwells = np.zeros(len(q))
     for i, direction in enumerate(directions):
         steep = math.hypot(direction[0], direction[1]) < 0.1
@@ -237,7 +240,7 @@ def _dwells(
 
 
 class _Motion:
-    """Consecutive phases of constant acceleration, built one by one."""
+    """A motion of consecutive phases of constant acceleration, which are appended one by one."""
 
     def __init__(self, position: FloatArray) -> None:
         self.duration_s = 0.0
@@ -247,9 +250,9 @@ class _Motion:
     def add(
         self, duration_s: float, velocity: FloatArray, acceleration: FloatArray, corner: int = -1
     ) -> None:
-        """Append a phase that starts at `velocity` (3,), unless its duration is not positive.
+        """Append a phase that starts at `velocity` (3,). Ignore it if its duration is not positive.
 
-        `corner` is the vertex that the phase rounds or waits at; -1 for none.
+        `corner` is the index of the vertex that the phase rounds or waits at, or -1 for none.
         """
         if not duration_s > 0.0:
             return
@@ -258,12 +261,12 @@ class _Motion:
         self.end = self.end + velocity * duration_s + 0.5 * acceleration * duration_s * duration_s
 
     def change_speed(self, direction: FloatArray, begin: float, end: float, a: float) -> None:
-        """Append a phase that changes the speed along a direction (3,)."""
+        """Append a phase that changes the speed along a direction (3,) from `begin` to `end`."""
         rate = math.copysign(a, end - begin)
         self.add((end - begin) / rate, begin * direction, rate * direction)
 
     def position(self, times_s: FloatArray) -> FloatArray:
-        """Return positions (k, 3) at the times (k,). After its end the motion stays at rest."""
+        """Return the positions (k, 3) at the times (k,). After its end, the motion is at rest."""
         starts_s, positions, velocities, accelerations, _ = map(
             np.array, zip(*self._rows, strict=True)
         )
@@ -276,7 +279,7 @@ class _Motion:
         return position
 
     def corners_during(self, begin_s: float, end_s: float) -> set[int]:
-        """Return the vertices that the phases in a time interval round or wait at."""
+        """Return the indices of the vertices that phases in a time interval round or wait at."""
         starts_s = [row[0] for row in self._rows]
         ends_s = [*starts_s[1:], self.duration_s]
         return {
@@ -287,7 +290,7 @@ class _Motion:
 
 
 def _motion(line: _Polyline, q: FloatArray, dwells_s: FloatArray, a: float) -> _Motion:
-    """Return the motion along the line with squared corner speeds `q` (n,).
+    """Return the motion along a path that passes its vertices at squared speeds `q` (n,).
 
     `dwells_s` (n,) is the waiting time at each vertex. It must be 0 unless the speed there is 0.
     """
@@ -324,7 +327,7 @@ def _motion(line: _Polyline, q: FloatArray, dwells_s: FloatArray, a: float) -> _
 def _blocked_corners(
     spline: FloatArray, moving: _Motion, grid: ObstacleGrid, period: float
 ) -> list[int]:
-    """Return the vertices that the spline rounds, or waits at, in pieces that are not free."""
+    """Return the indices of the vertices that blocked pieces of the spline round or wait at."""
     blamed: set[int] = set()
     for piece in np.flatnonzero(~_piecewise_free(spline, grid)):
         # Piece k depends on the control points at (k - 1) T, k T and (k + 1) T.
@@ -333,7 +336,7 @@ def _blocked_corners(
 
 
 def _piecewise_free(spline: FloatArray, grid: ObstacleGrid) -> NDArray[np.bool_]:
-    """Return, for each of the m - 2 spline pieces, True if its four chords are free."""
+    """Return, for each of the m - 2 pieces of a spline, True if its four chords are free."""
     first, second, third = spline[:-2, None], spline[1:-1, None], spline[2:, None]
     u = np.linspace(0.0, 1.0, 5)[:, None]
     # (m - 2, 5, 3)

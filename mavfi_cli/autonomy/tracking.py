@@ -52,10 +52,11 @@ ENDLESS_S = 2.0**63  # a slice of this length overflows a signed 64-bit number o
 
 
 def reference_waypoint(trajectory: Trajectory, time_s: float) -> FloatArray:
-    """Return the reference (10,), in the order of WAYPOINT_FIELDS, `time_s` after the start.
+    """Return the reference state of a trajectory `time_s` seconds after its start.
 
-    Before the start this is the first waypoint, and after the end it is the last point, at rest.
-    Corrupted waypoints are used unchanged.
+    The result is an array (10,) in the order of WAYPOINT_FIELDS. Before the start it is the first
+    waypoint, and after the end it is the last point, at rest. Corrupted waypoints are used
+    unchanged.
     """
     out = np.empty(10)
     _reference(trajectory.waypoints, trajectory.durations_s, time_s, out)
@@ -63,12 +64,12 @@ def reference_waypoint(trajectory: Trajectory, time_s: float) -> FloatArray:
 
 
 def waypoint_index(trajectory: Trajectory, time_s: float) -> int:
-    """Return the index of the waypoint at that time; 0 if the trajectory has none."""
+    """Return the index of the waypoint at `time_s`, or 0 if the trajectory has no waypoint."""
     return max(0, int(locate(trajectory.durations_s, time_s)[0]))
 
 
 def without_waypoint(trajectory: Trajectory, index: int) -> Trajectory:
-    """Drop one waypoint and fill its duration with the motion of the next.
+    """Return a trajectory in which the motion of the next waypoint replaces waypoint `index`.
 
     The next waypoint's motion is extended backwards over the dropped duration, so the trajectory
     keeps its timing and stays continuous there. The last waypoint is replaced by rest at the end of
@@ -92,7 +93,7 @@ def without_waypoint(trajectory: Trajectory, index: int) -> Trajectory:
 
 @compiled
 def locate(durations_s: FloatArray, time_s: float) -> tuple[int, float]:
-    """Return the index of the waypoint at `time_s`, and the time since it began, s.
+    """Return the index of the waypoint at `time_s`, and the time in seconds since it began.
 
     A `time_s` that is NaN or negative counts as zero. Without waypoints, the result is (-1, 0).
     """
@@ -135,14 +136,17 @@ def _reference(
 
 @compiled
 def _angle_between(start_rad: float, end_rad: float) -> float:
-    """Return the shorter turn from start to end in (-pi, pi]; NaN if an angle is not finite."""
+    """Return the shorter turn from one angle to another, in (-pi, pi].
+
+    The result is NaN if an angle is not finite.
+    """
     turn = (end_rad - start_rad) % TWO_PI
     return turn - TWO_PI if turn > math.pi else turn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackingParams:
-    """Gains and limits. v_max, a_max and the yaw rate are those of the released code."""
+    """Gains and limits of control. v_max, a_max and yaw rate are those of the released code."""
 
     kp_per_s: float = 0.8
     kp_climb_per_s: float = 0.8
@@ -160,7 +164,7 @@ class TrackingParams:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackingState:
-    """State of the controller: integral term, last commanded yaw, last stamp."""
+    """State of the controller between two ticks: integral term, last commanded yaw, last stamp."""
 
     integral_mps: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,)
     yaw_rad: float
@@ -252,7 +256,10 @@ def track(
     step_max_s: float,
     out: FloatArray,
 ) -> None:
-    """Run the controller. Write velocity, acceleration, integral and yaw into `out` (10,)."""
+    """Compute one step of the control law.
+
+    Velocity (3,), acceleration (3,), integral term (3,) and yaw are written to `out` (10,).
+    """
     step_s = elapsed_s if elapsed_s > 0.0 else 0.0
     step_s = min(step_s, step_max_s)
     for axis in range(3):
@@ -279,9 +286,10 @@ def track(
 
 @compiled
 def _demanded_mps(law: tuple[Any, ...], limits: tuple[float, float, float]) -> float:
-    """Return the commanded speed before the speed limit, m/s; inf on overflow.
+    """Return the speed, in m/s, that would be commanded without the speed limit.
 
-    `law` and `limits` are the arguments of `track` before and after the speed limit.
+    It is infinite on overflow. `law` and `limits` are the arguments of `track` that precede and
+    follow the speed limit.
     """
     out = np.empty(10)
     track(*law, math.inf, *limits, out)  # type: ignore[call-arg]  # `law` has twelve arguments
@@ -300,7 +308,7 @@ def _finite_or(value: float, fallback: float) -> float:
 
 @compiled
 def _limit_norm(vectors: FloatArray, start: int, limit: float) -> bool:
-    """Limit the norm of the three components from `start`. Return True if they were scaled.
+    """Limit the norm of three components, starting at index `start`. Return True if it scaled them.
 
     Safe for components whose squares overflow.
     """

@@ -64,17 +64,18 @@ def chosen(
     *,
     worlds: str | None = None,
 ) -> tuple[Spec, Path]:
-    """Find the named campaign and its folder.
+    """Return the specification and the folder of the campaign that `what` names.
 
     Args:
         what: a preset, a TOML file, or the folder of an existing campaign.
-        out: the folder; None means campaigns/NAME, or the named folder.
+        out: the campaign's folder; None means campaigns/NAME, or the folder that `what` names.
         scale: fraction of the repetitions; None for an existing folder, which stores its own.
         changes: factors to replace, as in `replaced`; they become part of the default folder's
             name.
-        programs: programs that a folder's missions may name; see
+        programs: programs that the missions in an existing folder are allowed to execute; see
             `MissionConfig.require_programs`.
-        sampling: how faults are drawn; None means as specified. This becomes part of the name too.
+        sampling: how faults are drawn; None means as specified. A change becomes part of the name
+            too.
         worlds: `fixed` or `many`, as in `Spec.in_worlds`; None means as specified.
 
     Raises:
@@ -100,7 +101,10 @@ def chosen_spec(
     *,
     worlds: str | None = None,
 ) -> Spec:
-    """Find the named specification as `chosen` does, but do not return its folder."""
+    """Return the specification of the campaign that `what` names, but not its folder.
+
+    See `chosen` for the arguments and errors.
+    """
     folder = _folder(what)
     if folder is None:
         spec = load_spec(what)
@@ -122,20 +126,23 @@ def chosen_spec(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Unflown(Spec):
-    """The unfinished missions of a study whose ledger stores a list but no factors."""
+    """A specification that lists the unfinished missions of a ledger that stores no factors."""
 
     left: list[PlannedMission]
 
     @classmethod
     def of(cls, ledger: Ledger) -> Self:
-        """Read the missions without a result, including those that could not begin.
+        """Read the missions that have no result, and those that could not begin, from a ledger.
 
         Raises:
             ConfigError: the ledger does not store which run folders to keep.
         """
         keep = ledger.meta("keep")
         if keep is None:
-            problem = "has no specification; the command that made its list flies the rest"
+            problem = (
+                "has no specification, so this command cannot continue it; use the command that "
+                "created it"
+            )
             raise ConfigError(problem, path=ledger.folder)
         cells, pairs = ledger.cells(), {row[0]: row[2] for row in ledger.rows()}
         left = [
@@ -145,18 +152,18 @@ class _Unflown(Spec):
         return cls(name=ledger.folder.name, keep=Keep(keep), left=left)
 
     def missions(self) -> list[PlannedMission]:
-        """See `Spec`."""
+        """Return the unfinished missions instead of a combination of factors."""
         return self.left
 
     kinds = missions
 
 
 def _folder_of(what: str) -> Path:
-    """Return the named folder, or the folder of the named campaign.
+    """Return the folder that `what` names, or the default folder of the campaign that it names.
 
     Args:
         what: a preset, a TOML file, or the folder of a campaign. A preset's name means the preset,
-            and ./NAME means the folder. If ./NAME holds a campaign, the name alone is refused.
+            and ./NAME means the folder. If ./NAME holds a campaign, the name alone is an error.
 
     Raises:
         ConfigError: a file is not a valid specification, or a name has two meanings.
@@ -170,7 +177,10 @@ def _folder_of(what: str) -> Path:
 
 @contextlib.contextmanager
 def opened(what: str | Path) -> Iterator[Ledger]:
-    """Open a campaign for reading: a preset, a TOML file, a folder, or an exported .parquet file.
+    """Open the ledger of a campaign for reading, and close it at the end of the block.
+
+    Args:
+        what: a preset, a TOML file, the folder of a campaign, or an exported .parquet file.
 
     Raises:
         MavfiError: as `_folder_of`, `Ledger` and `ExportedLedger`.
@@ -183,12 +193,19 @@ def opened(what: str | Path) -> Iterator[Ledger]:
 
 
 def _folder(what: str) -> Path | None:
-    """Return the named campaign's folder; None for a preset or a file."""
+    """Return the folder of a campaign if `what` names one, or None for a preset or a TOML file.
+
+    Raises:
+        ConfigError: `what` names an export.
+        UnknownName: no preset, file or folder has this name.
+    """
     folder = Path(what)
     if what in PRESETS.names:
         return None
     if is_export(folder):
-        raise ConfigError("an export has no list of missions to fly", path=folder)
+        raise ConfigError(
+            "cannot fly missions from an export, because it contains no mission list", path=folder
+        )
     if folder.is_dir() or (os.sep in what and folder.suffix != ".toml"):
         return folder
     if folder.suffix == ".toml":
@@ -198,12 +215,12 @@ def _folder(what: str) -> Path | None:
 
 
 def begun() -> list[str]:
-    """List the folders of all campaigns in the default location."""
+    """Return the paths of all campaign folders in `campaigns`, the default location, sorted."""
     return sorted(str(path.parent) for path in DEFAULT.glob(f"*/{LEDGER}"))
 
 
 def _require_one_meaning(what: str) -> None:
-    """Refuse a preset's name if a folder of that name holds a campaign."""
+    """Raise ConfigError if `what` names both a preset and a folder that holds a campaign."""
     if what in PRESETS.names and (Path(what) / LEDGER).is_file():
         own = DEFAULT / what
         raise ConfigError(
@@ -213,12 +230,16 @@ def _require_one_meaning(what: str) -> None:
 
 
 def resumed(spec: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[Spec, bool]:
-    """Return the specification for a study in a folder, and whether the folder's list grows.
+    """Match a study's specification with the study that a folder may already hold.
 
     A study with more repetitions continues one with fewer, because lists grow by repetition.
 
     Args:
         what, repetitions: words for the study and its repetitions in error messages.
+
+    Returns:
+        The specification with the stored name, description and policy for run folders, if any, and
+        whether missions must be appended to the stored list.
 
     Raises:
         ConfigError: the folder holds another campaign.
@@ -240,13 +261,13 @@ def resumed(spec: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[S
 
 
 def stored_spec(ledger: Ledger) -> Spec | None:
-    """Return a campaign's stored specification; None if its list was made without one."""
+    """Return the specification stored in a ledger, or None if its list was made without one."""
     text = ledger.meta("spec")
     return None if text is None else parse_spec(text, ledger.folder / SPEC)
 
 
 def stopped(ledger: Ledger) -> list[str]:
-    """Return the labels of the settings that the stopping rule has ended early."""
+    """Return the labels, as a phrase, of each setting that the stopping rule has ended early."""
     spec = stored_spec(ledger)
     if spec is None or spec.stop is None:
         return []
@@ -258,7 +279,11 @@ def stopped(ledger: Ledger) -> list[str]:
 
 
 def rounds_of(spec: Spec, ledger: Ledger) -> Rounds | None:
-    """Return the rounds of a stratified campaign with a stored list; None for a uniform one."""
+    """Return the rounds in which a stratified campaign draws faults, or None for a uniform one.
+
+    Args:
+        ledger: the campaign's ledger, open for writing, with a stored list of missions.
+    """
     if spec.sampling is Sampling.UNIFORM:
         return None
     return Rounds(ledger, spec.seed, spec.stop.batch if spec.stop else ROUND)
@@ -273,9 +298,11 @@ def begin(
     options: Options | None = None,
     spectator: Spectator | None = None,
 ) -> Ledger:
-    """Open a campaign's folder for writing, and store its list of missions.
+    """Open the ledger of a campaign for writing, and store the campaign's list of missions.
 
     Args:
+        append: add missions that an already stored list lacks.
+        missing_only: accept only a folder that already holds a campaign.
         options, spectator: used by the flights that search for fixed worlds, if there are any.
 
     Raises:
@@ -320,7 +347,9 @@ def begin(
 
 
 def _with_stored_worlds(spec: Spec, folder: Path, *, append: bool) -> Spec:
-    """Return the specification with the stored world seeds of its campaign.
+    """Return the specification with the seeds of fixed worlds that its folder already stores.
+
+    If the stored rule for fixed worlds differs, return the specification unchanged.
 
     Raises:
         ConfigError: missions are to be appended, but the rule for fixed worlds has changed.
@@ -343,13 +372,17 @@ def _with_stored_worlds(spec: Spec, folder: Path, *, append: bool) -> Spec:
 
 
 def flyable(spec: Spec) -> list[PlannedMission]:
-    """List the missions of a campaign. Raises MavfiError if a kind of mission cannot be flown."""
+    """Return the missions of a campaign, after checking that every kind of mission can be flown.
+
+    Raises:
+        MavfiError: as `Spec.missions` and `check_kinds`.
+    """
     check_kinds(spec.kinds())
     return spec.missions()
 
 
 def check_kinds(missions: Iterable[PlannedMission]) -> None:
-    """Check each kind of mission once, and each kind of vehicle process once.
+    """Check that every kind of mission can be flown, and every kind of vehicle process starts.
 
     Raises:
         MavfiError: as `check_names`, with the labels of the setting added.
@@ -368,7 +401,7 @@ def check_kinds(missions: Iterable[PlannedMission]) -> None:
 
 
 def check_names(config: MissionConfig, *, start: bool = True) -> None:
-    """Check that missions of this kind can be flown.
+    """Check that a mission with this configuration can be flown, without flying it.
 
     Args:
         start: also start the simulated vehicle, and stop it immediately.
@@ -416,7 +449,7 @@ def _with_worlds(
     options: Options,
     spectator: Spectator,
 ) -> Spec:
-    """Return the specification with a seed for every world that the rule covers.
+    """Return the specification with a seed for every world that its rule for fixed worlds covers.
 
     A candidate seed is judged by golden flights of the first mission in that world. This mission
     has the first value of every other factor, so all stacks and platforms share the chosen seed.

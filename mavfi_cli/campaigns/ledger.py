@@ -111,7 +111,7 @@ _PORTION = 5000  # rows that are read at once
 
 
 def _object(text: str | bytes) -> dict[str, Any]:
-    """Read a JSON object. Raises TypeError or ValueError."""
+    """Parse a JSON object. Raise TypeError or ValueError if the text is anything else."""
     value = json.loads(text)
     if not isinstance(value, dict):
         raise TypeError(f"must be a JSON object, got a {type(value).__name__}")
@@ -124,7 +124,8 @@ class Drawn(NamedTuple):
     Attributes:
         round: zero-based number of the round in which it was drawn.
         weight: number of uniformly drawn missions that this mission represents.
-        pair, changes: pair and configuration with this fault, as stored in the list of missions.
+        pair, changes: the mission's pair and configuration with this fault, in the format in which
+            the list of missions stores them.
     """
 
     number: int
@@ -136,20 +137,21 @@ class Drawn(NamedTuple):
 
 
 class Ledger:
-    """One campaign's missions and results.
+    """The database of one campaign: its list of missions, and their results.
 
     Use it as a context manager. Any number of readers may run alongside one writer.
 
     Attributes:
-        export: the table of flights, without records, of a ledger opened from an export; else None.
+        export: the table of flights if the ledger was opened from an export, otherwise None.
     """
 
     export: pa.Table | None = None
 
     def __init__(self, folder: Path, *, writing: bool = False, memory: bool = False) -> None:
-        """Open the ledger of a folder; a writer creates it if there is none.
+        """Open the ledger in a folder. If `writing` is set, create a missing folder and ledger.
 
-        With `memory` the ledger is empty and in memory, and `folder` only appears in messages.
+        With `memory`, open an empty ledger in memory instead; `folder` then only appears in error
+        messages.
 
         Raises:
             RecordError: the ledger is missing, damaged, or cannot be opened.
@@ -165,9 +167,9 @@ class Ledger:
                 self._become_writer()
                 undo.callback(self._unlock)
             elif not (memory or self._path.is_file()):
-                raise RecordError(f"{folder}: no campaign there (no {LEDGER})")
+                raise RecordError(f"{folder}: holds no campaign ({LEDGER} is missing)")
             if not memory and self._path.is_symlink():
-                raise RecordError(f"{self._path}: is a link")
+                raise RecordError(f"{self._path}: must not be a symbolic link")
             try:
                 self._db = self._connect(memory)
                 undo.callback(self._db.close)
@@ -183,7 +185,7 @@ class Ledger:
         self.close()
 
     def close(self) -> None:
-        """Close the ledger; a writer releases its lock."""
+        """Close the ledger, and release its lock if it was open for writing."""
         self._db.close()
         self._unlock()
 
@@ -260,19 +262,19 @@ class Ledger:
     # The campaign ---------------------------------------------------------------------------------
 
     def meta(self, key: str) -> str | None:
-        """Return the campaign's metadata stored under a key; None if there is none."""
+        """Return the text stored under `key` in the campaign's metadata, or None if it is unset."""
         values = [
             str(value) for (value,) in self._rows("SELECT value FROM meta WHERE key = ?", key)
         ]
         return values[0] if values else None
 
     def set_meta(self, values: Mapping[str, str]) -> None:
-        """Store metadata of the campaign by key, in one transaction."""
+        """Store metadata of the campaign under the given keys, replacing earlier values."""
         with self._transaction():
             self._db.executemany("REPLACE INTO meta VALUES (?, ?)", values.items())
 
     def plan(self, missions: Iterable[PlannedMission]) -> int:
-        """Append missions to the list; return how many were appended.
+        """Append missions to the list, and return how many were appended.
 
         Raises:
             RecordError: the ledger cannot be written, for example because the disk is full.
@@ -292,7 +294,7 @@ class Ledger:
 
     @property
     def stratified(self) -> bool:
-        """True if faults are drawn by stratum, so that missions have unequal weights."""
+        """Whether faults are drawn by stratum, so that missions have unequal weights."""
         return self._list == _DRAWN
 
     @property
@@ -301,14 +303,14 @@ class Ledger:
         return Sampling.STRATIFIED if self.stratified else Sampling.UNIFORM
 
     def draw(self, rows: Iterable[Drawn]) -> None:
-        """Store drawn faults, which replace those on the list, in one transaction."""
+        """Store the faults drawn for missions in one transaction, replacing those on the list."""
         self._list = _DRAWN
         with self._transaction():
             self._db.execute(_DRAWS)
             self._db.executemany("INSERT INTO draws VALUES (?, ?, ?, ?, ?, ?)", rows)
 
     def draws(self) -> dict[int, Drawn]:
-        """Return the faults drawn for missions, by number; empty in a uniform campaign."""
+        """Return the drawn faults, keyed by mission number. A uniform campaign has none."""
         rows = self._rows("SELECT * FROM draws") if self.stratified else ()
         return {row[0]: Drawn(*row) for row in rows}
 
@@ -320,13 +322,15 @@ class Ledger:
         results: Iterable[Json],
         draws: Sequence[Drawn] = (),
     ) -> None:
-        """Store all rows of a campaign, but no records.
+        """Fill an empty ledger with a campaign's settings, missions and results, without records.
 
         Args:
-            cells: number of each setting by its labels, which are canonical JSON.
-            missions: number, cell, pair and changes of every mission.
+            name: name of the campaign.
+            cells: number of each setting, keyed by its labels as canonical JSON.
+            missions: number, setting's number, pair and changes of every mission.
+            results: for each finished mission, its values in the table `results`, keyed by column;
+                a missing column is stored as NULL.
             draws: the faults drawn for missions of a stratified campaign.
-            results: columns of the table `results` by name; a missing column is stored as NULL.
 
         Raises:
             RecordError: a row has the wrong types, or a number occurs twice.
@@ -364,7 +368,10 @@ class Ledger:
         return cells
 
     def rows(self) -> Iterator[tuple[int, str, str, str]]:
-        """Yield number, labels, pair and changes of every mission as stored."""
+        """Yield the number, labels, pair and changes of every mission, as the list stores them.
+
+        The faults drawn for a stratified campaign are not applied; see `draws`.
+        """
         yield from self._rows(
             "SELECT number, labels, pair, changes FROM missions JOIN cells USING (cell) "
             "ORDER BY number"
@@ -410,7 +417,9 @@ class Ledger:
         return [cell for (cell,) in self._rows("SELECT cell FROM missions ORDER BY number")]
 
     def fates(self, *, errors: bool = True) -> Iterator[tuple[int, tuple[str | None, str | None]]]:
-        """Yield the number of every finished mission with its outcome and its fault's fate.
+        """Yield the number of every finished mission, and its outcome with the fate of its fault.
+
+        Both the outcome and the fate are None for a mission that could not begin.
 
         Args:
             errors: include missions that could not begin.
@@ -436,7 +445,7 @@ class Ledger:
         attempts: int,
         path: str | None,
     ) -> None:
-        """Store a mission's result in one transaction, replacing an earlier one.
+        """Store the result of a mission in one transaction, replacing any earlier result.
 
         Raises:
             RecordError: the ledger cannot be written, for example because the disk is full.
@@ -501,7 +510,7 @@ class Ledger:
                 yield over
 
     def configs(self, numbers: Sequence[int]) -> Iterator[MissionConfig]:
-        """Yield the configurations of these missions in the order of the list.
+        """Yield the configurations of the missions with these numbers, in the order of the list.
 
         Raises:
             RecordError: the stored changes of a mission are invalid.
@@ -515,12 +524,15 @@ class Ledger:
             try:
                 config = structure(_object(changes), MissionConfig)
             except (TypeError, ValueError, ConfigError) as error:
-                problem = f"the changes of mission {number} cannot be used ({error})"
+                problem = f"cannot read the configuration of mission {number} ({error})"
                 raise RecordError(f"{self.folder}: {problem}") from None
             yield config
 
     def columns(self, names: Sequence[str]) -> Iterator[list[tuple[Any, ...]]]:
-        """Yield portions of the flown missions, in the order of the list, as columns.
+        """Yield the named columns of all flown missions, in the order of the list.
+
+        The columns come in portions of rows. A portion is a list of columns, in the order of
+        `names`.
 
         Args:
             names: columns of the tables `missions` and `results`, `stratum`, `weight`, or the SQL
@@ -534,7 +546,10 @@ class Ledger:
             yield list(zip(*portion, strict=True))
 
     def errors_by_cell(self) -> dict[int, int]:
-        """Count the missions that could not begin, by cell; cells without any are absent."""
+        """Count the missions that could not begin, keyed by setting number.
+
+        Settings without such missions are omitted.
+        """
         return dict(
             self._rows(
                 "SELECT cell, count(*) FROM results JOIN missions USING (number) "
@@ -543,7 +558,7 @@ class Ledger:
         )
 
     def planned_by_cell(self) -> list[int]:
-        """Return the number of planned missions in each cell, in order of the cells' numbers."""
+        """Return the number of planned missions in each setting, in order of setting numbers."""
         rows = self._rows("SELECT count(*) FROM missions GROUP BY cell ORDER BY cell")
         return [count for (count,) in rows]
 
@@ -559,12 +574,12 @@ _ABSENT = {"reason": "", "wall_s": 0.0, "attempts": 1}  # values for columns tha
 
 
 def is_export(path: Path) -> bool:
-    """Return True if a path names an export rather than a folder."""
+    """Return True if a path has the suffix of an exported campaign and is not a folder."""
     return path.suffix == EXPORT and not path.is_dir()
 
 
 def stored_export(path: Path) -> pa.Table:
-    """Read an export.
+    """Read the table of an exported campaign, and check that it is complete.
 
     Raises:
         RecordError: the file is missing or damaged, lacks a column or a weight, or lists a mission
@@ -581,7 +596,7 @@ def stored_export(path: Path) -> pa.Table:
     counts = pc.value_counts(table["number"]).to_pylist()
     twice = next((entry["values"] for entry in counts if entry["counts"] > 1), None)
     if twice is not None:
-        problem = f"it has mission {twice} twice; exports of two campaigns are two files"
+        problem = f"it lists mission {twice} twice; keep the exports of two campaigns in two files"
         raise _no_export(path, problem)
     try:
         origin = stored_provenance(table)
@@ -614,12 +629,12 @@ def _no_export(path: Path, why: object) -> RecordError:
 
 
 def stored_provenance(table: pa.Table) -> dict[str, Any]:
-    """Return the provenance in the metadata of an export; empty if there is none."""
+    """Return the provenance stored in an export's metadata, or an empty dict without any."""
     return dict(json.loads((table.schema.metadata or {}).get(METADATA, b"{}")))
 
 
 class ExportedLedger(Ledger):
-    """A ledger in memory that holds the missions of an export, but no records of flights.
+    """An in-memory ledger with the missions and results of an export, but no flight records.
 
     Raises:
         RecordError: the file is not an export.
@@ -650,11 +665,12 @@ class ExportedLedger(Ledger):
         self.fill(name, cells, missions, (_ABSENT | row for row in known), draws)
 
     def results(self, numbers: Sequence[int] | None = None) -> Iterator[MissionResult]:
-        """Refuse to read, because an export has no records of flights.
+        """Raise RecordError, because an export contains no flight records.
 
         Raises:
             RecordError: always.
         """
         raise RecordError(
-            f"{self.folder}: an export has no records of flights; name the campaign's folder"
+            f"{self.folder}: cannot read flight records, because an export does not contain them; "
+            "use the campaign's folder"
         )

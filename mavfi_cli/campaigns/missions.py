@@ -31,8 +31,9 @@ class PlannedMission:
 
     Attributes:
         labels: the mission's setting; missions with equal labels are counted together.
-        pair: missions with equal pairs share world, start and noise. An empty string is replaced by
-            a hash of everything that the golden, faulty and protected flights of a pair share.
+        pair: identifier of the mission's pair; missions with equal pairs share world, start and
+            noise. An empty string is replaced by a hash of everything that the golden, faulty and
+            protected flights of a pair share.
     """
 
     config: MissionConfig
@@ -45,7 +46,7 @@ class PlannedMission:
 
     @property
     def stored(self) -> tuple[str, str, str]:
-        """Labels, pair, and changes of the configuration, as a ledger stores them."""
+        """The labels as JSON, the pair, and the changed fields as JSON, as a ledger stores them."""
         return canonical(dict(self.labels)), self.pair, canonical(changes_of(self.config))
 
 
@@ -63,7 +64,7 @@ def _pair_of(shared: tuple[Any, ...]) -> str:
 
 
 def canonical(value: Any) -> str:
-    """Return canonical JSON: equal values give equal text."""
+    """Return a value as canonical JSON, so that equal values give equal text."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
 
 
@@ -92,7 +93,7 @@ def _plain(value: Any) -> Any:
 
 
 def kind_of(changes: Changes, apart: Collection[str]) -> str:
-    """Return a mission as canonical JSON, without some fields and without the seeds of its fault.
+    """Return a mission's kind: its fields as canonical JSON, without the seeds of its fault.
 
     Args:
         changes: the mission's fields from `changes_of`.
@@ -107,25 +108,25 @@ def kind_of(changes: Changes, apart: Collection[str]) -> str:
 
 
 def label_text(labels: Labels) -> str:
-    """Describe a setting in a phrase that does not depend on the order of its labels."""
+    """Return a setting's labels as a phrase, such as `setting=FI world=farm`, in display order."""
     phrases = (f"{name}={label_value(labels[name])}" for name in ordered(labels))
     return " ".join(phrases) or "all missions"
 
 
 def label_value(value: Label) -> str:
-    """Format the value of a label as in a specification."""
+    """Return a label's value as text, with booleans in lower case as in a specification."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def ordered(names: Iterable[str]) -> list[str]:
-    """Return distinct label names in display order."""
+    """Return the distinct names of labels in display order: `_FIRST`, then alphabetically."""
     unordered = set(names)
     return [name for name in _FIRST if name in unordered] + sorted(unordered - set(_FIRST))
 
 
 @contextlib.contextmanager
 def naming(labels: Labels) -> Iterator[None]:
-    """Append the labels of the setting to errors raised in the block.
+    """Append the labels of a setting to the message of any error raised in the block.
 
     Raises:
         ConfigError: replaces any MavfiError and keeps its exit code.
@@ -140,7 +141,7 @@ def naming(labels: Labels) -> Iterator[None]:
 
 
 class MissingMission(NamedTuple):
-    """A mission without a result: its number, its setting's number, and what to fly."""
+    """A mission without a result: its number, its setting's number, and its configuration."""
 
     number: int
     cell: int
@@ -155,7 +156,7 @@ class Sampling(Enum):
 
 
 class ResultState(Enum):
-    """Whether a finished mission has a result."""
+    """Whether a finished mission was flown, or could not begin."""
 
     FLOWN = "flown"  # it ended with the given `outcome`
     ERROR = "error"  # it could not begin, so it has no result and is not counted
@@ -187,7 +188,11 @@ class Injected(Enum):
 
     @classmethod
     def of(cls, flight: FlightRecord, *, faulty: bool) -> Injected:
-        """Derive the fate of a mission's fault from the flight's record."""
+        """Return the fate of a mission's fault, derived from the record of the flight.
+
+        Args:
+            faulty: whether the mission was planned with a fault.
+        """
         fault = flight.fault
         if not faulty:
             return cls.GOLDEN
@@ -202,9 +207,10 @@ class Injected(Enum):
 
 
 def _caught(flight: FlightRecord) -> bool:
-    """Return True if an alarm that was not accepted matches a strike.
+    """Return True if an alarm that did not let its message pass matches a strike of the fault.
 
-    It matches by its stamp, or by a struck state if it follows the first strike.
+    An alarm matches if it has the stamp of a strike, or if it concerns a struck state and does not
+    precede the first strike.
     """
     stamps = {strike.stamp_s for strike in flight.strikes}
     states = {change.state for strike in flight.strikes for change in strike.changes}
@@ -234,7 +240,7 @@ class MissionResult:
             could write one, only the known fields. Empty for an error.
         injected: the fate of its fault; None for an error.
         reason: the record's reason for the outcome, or why the mission could not begin.
-        wall_s: wall time of the final attempt, s.
+        wall_s: wall time of the final attempt, in seconds.
         attempts: number of attempts; above 1 if something outside the mission spoilt an attempt.
         path: absolute path of the kept run folder; None if it was not kept.
         stratum, weight: stratum and weight in a stratified sample; None and 1 in a uniform one.

@@ -18,11 +18,11 @@ class Progress:
         running: flights that have not ended; missions that share a flight count as one.
         again: attempts that were repeated because something outside the mission ended them or may
             have affected them.
-        elapsed_s: wall time of this run, s.
-        inside_s: wall time spent in missions, summed over the workers, s.
+        elapsed_s: wall time of this run, in seconds.
+        inside_s: wall time spent in missions, summed over the workers, in seconds.
         workers: missions that can fly at the same time; None if that varies, as on a cluster.
         outcomes: outcomes of this run's missions by setting, in the order of the list.
-        beyond_s: estimated wall time of the work that follows the missions, s.
+        beyond_s: estimated wall time of the work that follows the missions, in seconds.
     """
 
     total: int
@@ -38,25 +38,25 @@ class Progress:
 
     @property
     def rate_per_h(self) -> float:
-        """Missions per hour of this run so far; 0 before the first has ended."""
+        """Missions finished per hour in this run so far, or 0 before the first has ended."""
         return 3600.0 * (self.over - self.before) / self.elapsed_s if self.elapsed_s > 0.0 else 0.0
 
     @property
     def eta_s(self) -> float | None:
-        """Remaining wall time at this rate, s; None before the first mission has ended."""
+        """Remaining wall time at this rate, in seconds, or None before a mission has ended."""
         rate = self.rate_per_h
         return 3600.0 * (self.total - self.over) / rate + self.beyond_s if rate > 0.0 else None
 
     @property
     def outside(self) -> float | None:
-        """Fraction of the workers' time spent outside missions; None if their number varies."""
+        """Fraction of the workers' time spent outside missions, or None if their number varies."""
         if self.workers is None or self.elapsed_s <= 0.0:
             return None
         return max(0.0, 1.0 - self.inside_s / (self.workers * self.elapsed_s))
 
     @property
     def success_rate(self) -> float | None:
-        """Success rate of this run's missions; None before the first has ended."""
+        """Success rate of this run's missions, or None before the first has ended."""
         whole = sum(self.outcomes.values(), Counter())
         return whole["success"] / whole.total() if whole else None
 
@@ -78,16 +78,21 @@ def duration(seconds: float) -> str:
 
 
 class Spectator:
-    """Observes a campaign. This base class ignores all events."""
+    """Observes a campaign while it runs. This base class ignores all events."""
 
     def on_progress(self, progress: Progress) -> None:
-        """Handle progress. Called after missions have ended, and at least every second."""
+        """Handle the current progress. Called after missions end, and at least every second."""
 
     def on_end(self, progress: Progress) -> None:
         """Handle the end of the run: all missions have ended, or the user interrupted it."""
 
     def on_note(self, text: str) -> None:
-        """Handle a note for the user."""
+        """Handle a message for the user, such as why an attempt at a mission is repeated."""
 
     def on_step(self, text: str, elapsed_s: float) -> None:
-        """Handle progress outside missions: a line of text, and wall time since its start, s."""
+        """Handle the progress of work that is not a mission, such as runs of isolated kernels.
+
+        Args:
+            text: the progress in one line.
+            elapsed_s: wall time since this work began, in seconds.
+        """

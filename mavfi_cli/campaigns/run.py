@@ -1,9 +1,9 @@
-"""Flies the missing missions of a campaign, each setting until a stopping rule, if any, ends it.
+"""Flies the missions of a campaign that have no result yet, and applies the stopping rule, if any.
 
-With a stopping rule, the interval of a setting's success rate is checked after every batch, over
-exactly the setting's missions up to that point in the list, regardless of the order in which they
-ended. So the number of workers does not affect when a setting stops. Repeated checks make the true
-confidence slightly lower than the nominal one.
+The stopping rule checks the confidence interval of a setting's success rate after every batch. It
+uses exactly the setting's missions up to that point in the list, regardless of the order in which
+they ended, so the number of workers does not affect when a setting stops. Repeated checks make the
+true confidence slightly lower than the nominal one.
 """
 
 from __future__ import annotations
@@ -67,23 +67,26 @@ _LOOK_S = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """Options of execution, which do not affect results.
+    """Options for running a campaign. None of them affects the results of its missions.
 
     Attributes:
         jobs: number of concurrent missions.
-        limit_s: limit of a mission's wall time, s; longer missions are recorded as `hang`.
-        task: module that flies a mission.
-        whole: fly every mission alone from its start, which gives the same records.
+        limit_s: wall time limit of one mission, in seconds; a longer mission is recorded as `hang`.
+        task: name of the module that flies a mission.
+        whole: fly every mission from its own start, instead of forking several from a shared
+            flight. The records are the same.
         errors: retry missions that could not begin.
         cluster: address of a dask.distributed scheduler; None for workers on this machine.
-        cluster_key: folder of its keys (`cluster_keys.make_keys`) for a tls:// address.
+        cluster_key: folder with the cluster's keys, required for a tls:// address; see
+            `cluster_keys.make_keys`.
         only: numbers of the missions to fly; None flies all.
         kept: numbers of missions whose run folders are kept regardless of `keep`.
         profiles: folder of instruction-level profiles that several campaigns share. None selects
-            the campaign's own, where profiles are removed after their last mission.
-        planned: numbers of the missions to fly; a profile is removed after the last of them that
-            needs it. None means all.
-        programs: programs that missions of the folder may name; see
+            the campaign's own folder, where a profile is removed after the last mission that needs
+            it.
+        planned: numbers of the missions to fly now or in a later call; a profile is removed after
+            the last of them that needs it. None means all.
+        programs: programs that the folder's missions are allowed to execute; see
             `MissionConfig.require_programs`.
     """
 
@@ -132,23 +135,23 @@ def run_campaign(
     append: bool = False,
     stop: Stop | None = None,
 ) -> Ledger:
-    """Fly the missions of a list that have no result in the folder yet.
+    """Fly the missions that have no result in the campaign's folder yet.
 
     Args:
-        missions: the list.
+        missions: the campaign's list of missions.
         folder: the campaign's folder, with ledger.sqlite and the kept run folders in runs/.
-        options: how to run them.
+        options: how to run the missions.
         spectator: observes the progress.
-        append: add new missions to the folder's list.
+        append: add missions that the list stored in the folder lacks.
         stop: the stopping rule; None flies all missions.
 
     Returns:
-        The ledger, open for reading; `results()` follows the order of the list.
+        The campaign's ledger, open for reading. Its `results()` are in the order of the list.
 
     Raises:
         ConfigError: the folder holds another list, versions or files have changed since it was
             stored, or another process is writing to the folder.
-        CampaignStopped: a problem with the machine prevents flights.
+        CampaignStopped: a problem with the machine prevents further flights.
         RecordError: the ledger cannot be written.
         Interrupted: the user pressed Ctrl-C; a second one kills the missions in flight.
     """
@@ -169,16 +172,20 @@ def store_plan(
     differing: Sequence[str] = (),
     can_append: str = "",
 ) -> None:
-    """Store a campaign's list of missions, or compare it with the stored list.
+    """Store a campaign's list of missions. If a list is already stored, check that both are equal.
 
     Args:
-        append: add missions that are not stored; stored ones always stay.
-        differing: descriptions of the differences, for the error message. If empty, the message
-            shows the first mission that is new and the first that is gone.
-        can_append: how to append missions; part of the error message if the list only adds some.
+        append: add missions that the stored list lacks, instead of raising an error. Stored
+            missions are never removed.
+        differing: descriptions of the differences between the lists, for the error message. If
+            empty, the message shows the first mission that only the new list contains, and the
+            first that only the stored list contains.
+        can_append: instructions for appending missions, which the error message includes if the
+            new list only adds missions.
 
     Raises:
-        ConfigError: the stored list differs, or as `require_unchanged`.
+        ConfigError: the stored list differs, or versions or files have changed; see
+            `require_unchanged`.
     """
     require_unchanged(ledger)
     left = Counter(row[1:] for row in ledger.rows())
@@ -216,10 +223,10 @@ def fly_missing(
     stop: Stop | None = None,
     rounds: Rounds | None = None,
 ) -> None:
-    """Fly every mission without a result, subject to the stopping rule.
+    """Fly every mission that has no result yet, unless the stopping rule has ended its setting.
 
     Args:
-        rounds: the rounds of a stratified campaign.
+        rounds: the rounds in which a stratified campaign draws its faults; None if it is uniform.
 
     Raises:
         MavfiError: as `run_campaign`.
@@ -231,7 +238,10 @@ def fly_missing(
 
 @contextlib.contextmanager
 def _prepared(folder: Path, profiles: Path) -> Iterator[None]:
-    """Create the folders for attempts and profiles; empty the former before and remove it after."""
+    """Create the folders for attempts and profiles, and remove the former after the block.
+
+    The folder for attempts is emptied first.
+    """
     work = own_folder(folder / WORK)
     shutil.rmtree(work, ignore_errors=True)
     for path in (work, profiles):
@@ -243,16 +253,18 @@ def _prepared(folder: Path, profiles: Path) -> Iterator[None]:
 
 
 class MissionQueue:
-    """A queue of the missing missions in list order, in batches if there is a stopping rule.
+    """A queue of the missing missions, in list order. A stopping rule admits them in batches.
 
     Args:
-        missing: yields the missions without a result, and None while the next one is not drawn yet.
+        missing: iterator over the missions without a result. It yields None while the fault of the
+            next mission has not been drawn yet.
         stop: the stopping rule; None admits all missions.
-        cells: setting of every mission, in the order of the list.
-        over: number, outcome and fault's fate of every finished mission.
+        cells: number of each mission's setting, in the order of the list; needed only with `stop`.
+        over: for each finished mission, its number, and its outcome with the fate of its fault.
         shares: whether missions may share a flight.
-        drawn: strata and weights of the missions of a stratified campaign, by number.
-        stopped: the set to which the numbers of stopped settings are added; None makes a new set.
+        drawn: the draw of each mission of a stratified campaign, keyed by mission number.
+        stopped: set to which the queue adds the numbers of the settings that the rule ends; None
+            creates a new set.
 
     Attributes:
         stopped: numbers of the settings that the rule has ended.
@@ -281,14 +293,14 @@ class MissionQueue:
             members.append(number)
         self._open = dict.fromkeys(self._members, stop.batch if stop else 0)
         self._over: dict[int, Row] = {}
-        self._finished: Counter[int] = Counter()  # finished ones among the admitted missions
+        self._finished: Counter[int] = Counter()  # number of admitted missions that have finished
         self._drawn = {} if drawn is None else drawn
         self.stopped: set[int] = set() if stopped is None else stopped
         for number, row in over if stop else ():
             self.record(number, row)
 
     def next(self) -> MissingMission | None:
-        """Return the next mission that may begin; None if there is none now."""
+        """Return the next mission that may begin, or None if no mission may begin at the moment."""
         while True:
             heads = {next(iter(read)): cell for cell, read in self._read.items() if read}
             ready = [number for number in heads if self._passes(number)]
@@ -299,7 +311,10 @@ class MissionQueue:
                 return None
 
     def mates(self, mission: MissingMission, most: int) -> list[MissingMission]:
-        """Take at most `most` further missions that may begin now and share a mission's flight."""
+        """Remove and return at most `most` missions that can share the flight of `mission`.
+
+        Only missions that may begin now are returned.
+        """
         if not self._shares:
             return []
         while sum(map(len, self._read.values())) < _AHEAD and self._read_one():
@@ -310,7 +325,7 @@ class MissionQueue:
         return [self._take(number, waiting[number]) for number in ready[:most]]
 
     def _read_one(self) -> bool:
-        """Read the next mission of the list; return False if there is none, or none yet."""
+        """Read the next mission. Return False if the list has ended, or has to wait for a draw."""
         mission = next(self._missing, None)
         if mission is None:
             return False
@@ -336,7 +351,10 @@ class MissionQueue:
         return cell not in self.stopped and self._place[number] < self._open[cell]
 
     def record(self, number: int, row: Row) -> None:
-        """Record the end of a mission; after a full batch, stop its setting or admit the next."""
+        """Record that a mission has ended. After a full batch, check the stopping rule.
+
+        The rule then ends the mission's setting, or the setting's next batch is admitted.
+        """
         if self._stop is None:
             return
         cell = self._cells[number]
@@ -421,7 +439,7 @@ class _Run:
         self._begun = time.monotonic()
 
     def fly(self, interrupts: Sequence[int]) -> None:
-        """Fly until nothing is missing or the user interrupts."""
+        """Fly until no mission is missing or the user interrupts."""
         announced, options = False, self._options
         fleet: LocalWorkers | Cluster
         if options.cluster is None:
@@ -482,7 +500,7 @@ class _Run:
         return [mission, *self._queue.mates(mission, most - 1)]
 
     def _note_unforked(self, over: Sequence[AttemptEnd]) -> None:
-        """Note which missions were not forked and must be flown alone, and why."""
+        """Remember which missions could not be forked, and why, so that they are flown alone."""
         reasons = {ended.number: ended.unforked for ended in over if ended.unforked}
         self._alone |= reasons
         for reason, count in Counter(reasons.values()).items():
@@ -522,7 +540,7 @@ class _Run:
         shutil.rmtree(out, ignore_errors=True)
 
     def _forget_profiles(self, config: MissionConfig) -> None:
-        """Remove the profiles of a golden run after the last mission that uses them."""
+        """Remove the profiles of a mission's golden run if no other missing mission needs them."""
         if (golden := config.golden) not in self._sharing:
             return
         if config.instruction is not None:
@@ -533,7 +551,7 @@ class _Run:
             shutil.rmtree(kept, ignore_errors=True)
 
     def _settle(self, ended: AttemptEnd, verdict: AttemptResult, config: MissionConfig) -> None:
-        """Store a finished mission: first its run folder, then its row."""
+        """Store a finished mission: first its run folder, if it is kept, then its ledger row."""
         assert verdict.state is not None
         number, path, flight = ended.number, None, FlightRecord.of(verdict.result)
         outcome = flight.outcome or None
@@ -579,7 +597,7 @@ class _Run:
 
 
 def _put_away(run: Path, runs: Path, number: int) -> Path:
-    """Move a run folder to the kept runs; return its new path."""
+    """Move a run folder into the folder of kept runs, and return its new path."""
     stem = run.name.rpartition("-")[0] if (run / RESULT).is_file() else "cut-off"
     place = own_folder(runs) / f"{number:06d}-{stem}"
     sync_folder(run)
@@ -591,7 +609,9 @@ def _put_away(run: Path, runs: Path, number: int) -> Path:
 
 
 def require_unchanged(ledger: Ledger) -> None:
-    """Require that versions and files are the same as when the campaign began.
+    """Check that versions and mission files are the same as when the campaign began.
+
+    If the ledger does not store versions yet, store the installed ones.
 
     Raises:
         ConfigError: a version or a file has changed.
@@ -603,7 +623,9 @@ def require_unchanged(ledger: Ledger) -> None:
     elif stored != canonical(versions):
         differing = version_differences(json.loads(stored), versions)
         raise ConfigError(
-            f"was begun with other versions: {'; '.join(differing)}", path=ledger.folder
+            "cannot be continued, because versions have changed since it began (install the "
+            f"earlier ones, or choose another folder): {'; '.join(differing)}",
+            path=ledger.folder,
         )
     noted = json.loads(ledger.meta("files") or "{}")
     changed = [name for name, digest in noted.items() if digest != file_digest(name)]
@@ -615,7 +637,7 @@ def require_unchanged(ledger: Ledger) -> None:
 
 
 def _note_files(ledger: Ledger, missions: Iterable[PlannedMission]) -> None:
-    """Store digests of the files that missions name, for `require_unchanged`."""
+    """Store digests of the files that missions name, so that `require_unchanged` can check them."""
     noted = json.loads(ledger.meta("files") or "{}")
     named = {name for mission in missions for name in mission.config.files}
     new = {name: file_digest(name) for name in sorted(named - noted.keys())}

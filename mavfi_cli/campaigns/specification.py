@@ -61,7 +61,7 @@ def _mission_of(values: Factors, seed: int, fault_seeds: Mapping[str, int]) -> M
 
 
 def _fault(values: Factors, seeds: Mapping[str, int]) -> Factors:
-    """Return a mission's field `fault` or `instruction` as a dict; empty without a fault."""
+    """Return a mission's `fault` or `instruction` field as a dict, or {} if it has no fault."""
     given = {name: value for name, value in values.items() if name not in (*MISSION, *_DETECTOR)}
     level = given.pop("level", "source")
     if level not in [*_LEVELS]:
@@ -96,7 +96,7 @@ class Keep(Enum):
     ALL = "all"
 
     def wants(self, number: int, outcome: str | None) -> bool:
-        """Return True if the run folder of this mission is to be kept."""
+        """Return True if the run folder of mission `number`, with this outcome, is to be kept."""
         if self is Keep.ALL or self is Keep.NONE:
             return self is Keep.ALL
         mixed = number  # hashed, so that sampled successes cover all settings in whatever order
@@ -112,17 +112,19 @@ Flown = tuple[tuple[int, ...], ...]  # for each candidate, the replans of its go
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixedWorld:
-    """The table `[fixed_world]` of a specification.
+    """The table `[fixed_world]` of a specification: worlds with one seed, and how it is chosen.
 
     Attributes:
-        replans: smallest and largest accepted median of the golden runs' replans. None means no
-            rule, so that only the worlds in `world_seed` are fixed.
-        flights: number of golden runs per candidate; seeds start at the campaign's first.
-        candidates: world seeds from 1 to this number are tried; the first that fits is chosen.
-        worlds: the worlds that the rule covers; empty for all of the campaign but world files.
+        replans: smallest and largest accepted median of the number of replans in a golden run. None
+            means no rule, so that only the worlds in `world_seed` are fixed.
+        flights: number of golden runs per candidate; their seeds start at the campaign's first.
+        candidates: world seeds from 1 to this number are tried; the first that satisfies the rule
+            is chosen.
+        worlds: the worlds that the rule covers; if empty, all worlds of the campaign except world
+            files.
         world_seed: seed of every fixed world, given by the user or chosen by the rule.
-        flown: replans of the golden runs of candidates 1, 2, 3, ...; a candidate whose flights
-            could not begin has fewer than `flights` values.
+        flown: for each world, the numbers of replans in the golden runs of candidates 1, 2, 3, ...;
+            a candidate whose flights could not begin has fewer than `flights` numbers.
     """
 
     replans: tuple[int, int] | None = None
@@ -139,7 +141,7 @@ class FixedWorld:
                 f"replans: must be [LEAST, MOST] with 0 <= LEAST <= MOST, got [{least}, {most}]"
             )
         if self.replans is None and not self.world_seed:
-            raise ValueError("must have replans or world_seed")
+            raise ValueError("must have replans or world_seed, but has neither")
         if self.flights < 1 or self.candidates < 1:
             raise ValueError(
                 "flights and candidates: must be at least 1, "
@@ -159,13 +161,17 @@ class FixedWorld:
         return named or ruled
 
     def fits(self, replans: Sequence[int]) -> bool:
-        """Return True if a candidate fits the rule, given the replans of its golden runs."""
+        """Return True if a candidate satisfies the rule.
+
+        Args:
+            replans: number of replans in each golden run of the candidate.
+        """
         assert self.replans is not None
         least, most = self.replans
         return len(replans) == self.flights and least <= statistics.median(replans) <= most
 
     def describe(self, worlds: Container[str]) -> str:
-        """Describe the seeds of these worlds, and the rule, in one line; empty without both."""
+        """Return the seeds of these worlds, and the rule, as one line. It is empty without both."""
         phrases = []
         for world, seed in self.world_seed.items():
             if world in worlds:
@@ -177,7 +183,7 @@ class FixedWorld:
         return f"world seeds: {', '.join(phrases or ['none yet'])}; {self.rule()}"
 
     def rule(self) -> str:
-        """Describe the rule in a phrase; empty without a rule."""
+        """Return the rule as a phrase, which is empty without a rule."""
         if self.replans is None:
             return ""
         least, most = self.replans
@@ -194,7 +200,7 @@ LISTS = ("start", "goal", "isolate", "protect", "exact_bits", "sites", "roles", 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
-    """A group of missions, whose own factors are crossed with the common ones."""
+    """A group of missions. Its own factors are crossed with those that all settings share."""
 
     name: str = ""
     axes: Axes = field(default_factory=dict)
@@ -211,7 +217,7 @@ class Stop:
 
     Attributes:
         margin: largest half-width of the Wilson interval of the success rate.
-        confidence: confidence of that interval.
+        confidence: confidence level of that interval.
         batch: number of a setting's missions between two checks of the interval.
     """
 
@@ -269,21 +275,21 @@ class Spec:
             self.stop is not None or self.sampling is not Sampling.UNIFORM
         ):
             raise ValueError(
-                "faults_per_invocation: must be 1 with a stop rule or stratified sampling, because "
-                f"both treat missions as independent, got {self.faults_per_invocation}"
+                "faults_per_invocation: must be 1 with a stopping rule or stratified sampling, "
+                f"because both treat missions as independent; got {self.faults_per_invocation}"
             )
         named = {*self.fixed, *self.axes, *(name for own in self.settings for name in own.axes)}
         if self.sampling is not Sampling.UNIFORM and "companion" in named:
             raise ValueError(
-                f"sampling: must be {Sampling.UNIFORM.value} with a user's companion, whose faults "
-                f"have no strata, got {self.sampling.value}"
+                f"sampling: must be {Sampling.UNIFORM.value} with a user's companion, because its "
+                f"faults have no strata; got {self.sampling.value}"
             )
 
     def scaled(self, scale: float) -> Spec:
-        """Return the same campaign with a fraction of its repetitions, but at least one.
+        """Return the same campaign with its repetitions multiplied by `scale`, but at least one.
 
         Raises:
-            ConfigError: the scale is not above 0.
+            ConfigError: the scale is not above 0 or not finite.
         """
         if not (math.isfinite(scale) and scale > 0.0):
             raise ConfigError(f"must be finite and above 0, got {scale:g}", key="scale")
@@ -299,15 +305,18 @@ class Spec:
         return replace(self, repetitions=repetitions, settings=settings)
 
     def describe_worlds(self) -> str:
-        """Describe the fixed worlds in one line; empty without `[fixed_world]`."""
+        """Return the fixed worlds and their rule as one line, which is empty without them."""
         flown = {kind.config.world for kind in self.kinds()}
         return "" if self.fixed_world is None else self.fixed_world.describe(flown)
 
     def in_worlds(self, worlds: str) -> Spec:
-        """Return the same campaign in its `fixed` worlds, or in `many`, one for each seed.
+        """Return the same campaign in fixed worlds, or in many worlds, one for each seed.
+
+        Args:
+            worlds: `fixed` or `many`.
 
         Raises:
-            ConfigError: it has no fixed worlds.
+            ConfigError: the campaign has no fixed worlds.
         """
         if self.fixed_world is None:
             raise ConfigError(f"campaign {self.name!r} has no fixed worlds", key="worlds")
@@ -316,7 +325,7 @@ class Spec:
         return replace(self, name=f"{self.name}-many-worlds", fixed_world=None)
 
     def missions(self) -> list[PlannedMission]:
-        """List the missions repetition by repetition, so that pairs and settings grow together.
+        """Return all missions, one repetition after another, so that all settings grow together.
 
         Raises:
             ConfigError: there are no missions or more than MOST, or a combination is invalid.
@@ -333,7 +342,7 @@ class Spec:
         ]
 
     def kinds(self) -> list[PlannedMission]:
-        """Return the first mission of every combination; the others differ only in seeds.
+        """Return the first mission of each combination of factors. The others differ only in seeds.
 
         Raises:
             ConfigError: as `missions`.
@@ -341,11 +350,11 @@ class Spec:
         return [self._mission(values, labels, 0) for values, labels, _ in self._points()]
 
     def programs(self) -> frozenset[str]:
-        """Return the programs that the missions name and execute. Raises as `kinds`."""
+        """Return the programs that the missions execute. Raise the same errors as `kinds`."""
         return frozenset(name for kind in self.kinds() for name in kind.config.programs)
 
     def _points(self) -> list[tuple[Factors, Labels, int]]:
-        """Combine the factors; return each combination with its labels and repetitions."""
+        """Return each combination of factors, with its labels and its number of repetitions."""
         crossed = [
             ({**self.axes, **setting.axes}, setting.name, setting.repetitions or self.repetitions)
             for setting in self.settings
@@ -388,7 +397,9 @@ class Spec:
             return PlannedMission(config=config, labels=labels)
 
     def differences(self, other: Spec, repetitions: str = "repetitions") -> list[str]:
-        """Describe every difference from `other` in factors, settings, numbers and sampling.
+        """Return a phrase for each difference from `other` that affects the list of missions.
+
+        In a phrase, `there` means this specification, and `here` means `other`.
 
         Args:
             repetitions: the word for repetitions in the descriptions.
@@ -404,7 +415,7 @@ class Spec:
         ]
 
     def _choices(self, repetitions: str) -> dict[str, list[Any]]:
-        """Return the values of each factor, and the other compared properties, by description."""
+        """Return the values of each factor and compared property, keyed by a phrase for each."""
         choices: dict[str, list[Any]] = {}
         for axes in (self.axes, *(setting.axes for setting in self.settings)):
             for name, values in axes.items():
@@ -460,7 +471,7 @@ class Spec:
         return toml_text({**plain, **tables})
 
     def sampled(self, sampling: Sampling) -> Spec:
-        """Return the same campaign with another sampling method, which is appended to its name.
+        """Return the same campaign with this sampling method. A new method is added to its name.
 
         Raises:
             ConfigError: the campaign cannot use this sampling method.
@@ -480,7 +491,7 @@ def _listed(values: Sequence[Any] | None) -> str:
 def require_named(
     key: str, names: Sequence[str], known: Sequence[str] | None = None, least: int = 1
 ) -> None:
-    """Require at least `least` names, all different and known.
+    """Check that there are at least `least` names, and that all of them are known and different.
 
     Raises:
         ConfigError: there are too few names, or one occurs twice.

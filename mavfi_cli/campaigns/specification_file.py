@@ -55,12 +55,12 @@ def load_spec(name: str) -> Spec:
 
 
 def parse_spec(text: str, path: Path) -> Spec:
-    """Parse a specification in TOML. `path` locates errors and gives the default name."""
+    """Parse a specification from TOML text. `path` appears in errors and gives the default name."""
     return _read_spec(parse_toml(text, path), path, text)
 
 
 def _read_spec(data: Factors, path: Path, text: str = "") -> Spec:
-    """Read a specification from TOML tables; `path` and `text` locate errors."""
+    """Read a specification from TOML tables. `path` and `text` only serve to locate errors."""
     _require_table(data, "", _TOP, path)
     mission, factors = data.get("mission", {}), data.get("factors", {})
     settings = data.get("setting", [{}])
@@ -114,7 +114,7 @@ def _require_usable(name: str, value: Any, key: str, path: Path) -> None:
 
 
 def _axes(table: Factors, place: str, path: Path) -> Axes:
-    """Read a table of factors, each of which has one or more values."""
+    """Return the values of each factor in a table. A single value becomes a tuple of one."""
     axes: dict[str, tuple[Any, ...]] = {}
     for name, value in table.items():
         key, several = f"{place}.{name}", isinstance(value, list)
@@ -139,7 +139,7 @@ _LONGEST = 100  # characters of a folder's name; the end of a longer one becomes
 
 
 def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
-    """Return the specification with some factors replaced, and the changes added to its name.
+    """Return the specification with the given changes to factors, which are added to its name.
 
     A factor is replaced in all settings that have it. A mission factor that the specification
     lacks is added to all missions. A factor of instruction-level faults, such as `compat`, is
@@ -192,7 +192,10 @@ def _replace(data: dict[str, Any], key: str, values: list[Any]) -> None:
     if not tables and key not in fixed and (key not in MISSION or key == "seed"):
         known = {name for table in (fixed, crossed, *data["setting"]) for name in table}
         have = ", ".join(sorted(known & set(NAMES))) or "none"
-        raise ConfigError(f"the campaign has no such factor to replace; it has {have}", key=key)
+        raise ConfigError(
+            f"cannot be set, because it is not a factor of this campaign; its factors: {have}",
+            key=key,
+        )
     one = not isinstance(values[0], list) if key in LISTS and values else len(values) == 1
     if not tables and one:
         fixed[key] = values if key in LISTS else values[0]

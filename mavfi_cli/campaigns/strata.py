@@ -97,7 +97,11 @@ def _part_of(kind: BitType, bit: int) -> tuple[str, str]:
 
 
 def coarsened(strata: Sequence[Stratum], least: float) -> frozenset[Stratum]:
-    """Merge strata, finest level first, so that each has a share of at least `least`.
+    """Merge strata, finest level first, until each holds a share of at least `least`.
+
+    Args:
+        strata: the finest stratum of each seed, with repetitions.
+        least: smallest share of the seeds that a stratum other than the empty one may hold.
 
     Returns:
         The strata that remain, including the empty one. A seed belongs to the longest of them that
@@ -123,7 +127,7 @@ def _coarse(stratum: Stratum, kept: frozenset[Stratum]) -> Stratum:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Strike:
-    """One fault of the list, and the missions that it strikes, with and without detectors.
+    """One fault on the list, and the missions that have it, with and without detectors.
 
     Attributes:
         config: one of these missions.
@@ -143,14 +147,14 @@ class _Strike:
 
 
 class Rounds:
-    """The rounds of a stratified campaign.
+    """The rounds in which a stratified campaign draws the faults of its missions.
 
     Missions with equal faults but different detectors also get equal faults when these are drawn.
 
     Args:
         ledger: ledger of the campaign, open for writing, with a stored list.
         seed: root of the seeds of all faults.
-        size: repetitions of a round; the last round has fewer than twice as many.
+        size: number of repetitions in a round; the last round has fewer than twice as many.
 
     Attributes:
         drawn: the faults drawn so far, by mission number.
@@ -194,10 +198,10 @@ class Rounds:
         return [members[begin:end] for begin, end in itertools.pairwise(cuts)]
 
     def missing(self, stopped: Collection[int], *, errors: bool) -> Iterator[MissingMission | None]:
-        """Yield the missing missions, drawing each round once all earlier missions have ended.
+        """Yield the missing missions, and draw each round once all earlier missions have ended.
 
         Args:
-            stopped: settings that the stopping rule has ended so far.
+            stopped: numbers of the settings that the stopping rule has ended so far.
             errors: include missions that could not begin.
 
         Yields:
@@ -224,7 +228,10 @@ class Rounds:
         ]
 
     def _parts(self, number: int) -> list[list[int]]:
-        """Return a round's missions as one part, or fault-free ones first if draws need them."""
+        """Return the numbers of a round's missions in parts that are flown one after another.
+
+        If draws need the results of fault-free missions, these form the first of two parts.
+        """
         strikes = self._strikes(number)
         plain = [mission for mission, _ in self._plain.get(number, ())]
         struck = [mission for strike in strikes for mission in strike.numbers]
@@ -248,7 +255,7 @@ class Rounds:
     def _drawn(
         self, kind: str, rounds: Sequence[Sequence[_Strike]], number: int
     ) -> Iterator[Drawn]:
-        """Draw the faults of one kind of mission in a round."""
+        """Yield the faults drawn for the missions of one kind in round `number`."""
         strikes = rounds[number]
         first = [stratum for pool in self._pools(kind, rounds, 0) for _, stratum in pool]
         kept = coarsened(first, 2.0 / len(rounds[0]))
@@ -288,7 +295,12 @@ class Rounds:
     def _rows(
         self, strike: _Strike, number: int, place: _Strike, seed: int, stratum: str, weight: float
     ) -> Iterator[Drawn]:
-        """Yield the missions of a strike with a drawn fault and the mission seed of `place`."""
+        """Yield the draw of each mission of a strike.
+
+        Args:
+            place: the strike whose mission seed the missions get.
+            seed: seed of the fault that they get.
+        """
         for mission, config in zip(
             strike.numbers, self._ledger.configs(strike.numbers), strict=True
         ):
@@ -301,7 +313,7 @@ class Rounds:
     def _pools(
         self, kind: str, rounds: Sequence[Sequence[_Strike]], number: int
     ) -> list[list[tuple[int, Stratum]]]:
-        """Return the pool of each strike in a round: seeds and their strata."""
+        """Return a pool for each strike in a round: its possible seeds, each with its stratum."""
         requests = self._requests(rounds[number])
         begin = sum(map(len, rounds[:number]))
         pools = []
@@ -331,7 +343,7 @@ class Rounds:
         return requests
 
     def _spreads(self, rounds: Sequence[Sequence[_Strike]]) -> dict[str, float]:
-        """Return the spread of failures in each stratum.
+        """Return the standard deviation of a mission's failure, 1 or 0, in each stratum.
 
         Missions with a detector count only for strikes that have no mission without one.
         """

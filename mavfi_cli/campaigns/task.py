@@ -35,16 +35,17 @@ def prepare() -> None:
 
 
 def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> Path:
-    """Fly a mission, or several that share a flight; return the run folder of this process.
+    """Fly a mission, or several that share a flight. Return the run folder of this process.
 
     Args:
         task: "missions", triples of a number, the changes from `missions.changes_of` and a folder;
-            "limit_s", the wall time limit of each mission, s; "alone", the reason why a mission
-            does not share a flight, or "".
+            "limit_s", the wall time limit of each mission, in seconds; "alone", the reason why a
+            mission does not share a flight, or "".
         out: folder of the mission, or of the shared flight, whose files are not kept.
+        forks: forks this process for each mission of a shared flight; None for a single mission.
 
     Raises:
-        SystemExit: this process has flown the shared flight, which is no mission of its own.
+        SystemExit: this process has flown only the shared flight, which is not a mission itself.
         MavfiError: the mission could not begin, or its record could not be written.
     """
     from mavfi_cli.core.config import structure

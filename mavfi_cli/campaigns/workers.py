@@ -41,16 +41,19 @@ if TYPE_CHECKING:
 
 
 class CampaignStopped(MavfiError):
-    """The machine has a problem that affects more than one mission."""
+    """A problem that affects more than one mission, such as a full disk, stopped the campaign."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AttemptResult:
-    """The judged result of an attempt.
+    """How an attempt at a mission counts, judged from the way in which it ended.
 
     Attributes:
-        state: state of the mission; None if something outside ended the attempt.
+        state: the state to store for the mission; None if something outside the mission ended the
+            attempt, so that it does not count.
         result: the mission's record; empty if there is none.
+        reason: the reason for the outcome, or why there is no outcome.
+        run: the attempt's run folder; None if there is none.
         doubtful: true if something outside the mission may have affected the record.
     """
 
@@ -63,16 +66,18 @@ class AttemptResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AttemptEnd:
-    """The end of one attempt at a mission.
+    """How the process of one attempt at a mission ended.
 
     Attributes:
-        exit: exit code of the mission's process; None if it was killed.
-        signal: signal that killed it; None after a time-out or if its guard was killed too.
-        timeout: true if the mission exceeded its wall time.
-        report: the mission's last message, with its folder, an error and its text, or a traceback.
-        lost: the reason if neither exit code, signal nor time-out is known.
-        unforked: reason why it was not forked from its shared flight; else empty.
-        wall_s: wall time of the whole attempt, including the guard's work, s.
+        exit: exit code of the mission's process; None if it did not exit by itself.
+        signal: signal that killed the process; None after a time-out, or if its guard was killed
+            too.
+        timeout: true if the mission exceeded its limit of wall time.
+        report: the last message of the mission's process, with its run folder, an error and its
+            text, or a traceback.
+        lost: the reason to give if the exit code, the signal and the time-out are all unknown.
+        unforked: why the mission could not be forked from its shared flight; otherwise empty.
+        wall_s: wall time of the whole attempt, including the guard's work, in seconds.
     """
 
     number: int
@@ -85,12 +90,12 @@ class AttemptEnd:
     wall_s: float = 0.0
 
     def judge(self, out: Path, config: MissionConfig, limit_s: float) -> AttemptResult:
-        """Judge the end of the attempt.
+        """Decide how the attempt counts, from the way in which it ended.
 
         Args:
             out: the attempt's own folder.
             config: configuration of the mission.
-            limit_s: limit of its wall time, s.
+            limit_s: wall time limit of the mission, in seconds.
 
         Raises:
             CampaignStopped: the machine cannot fly any mission, for example because the disk is
@@ -127,7 +132,7 @@ Attempt = tuple[int, Changes, Path]  # mission number, changes, the attempt's ow
 
 
 class LocalWorkers:
-    """Runs up to `jobs` flights at a time."""
+    """Runs up to `jobs` flights at a time, in processes on this machine."""
 
     def __init__(self, jobs: int, module: str = TASK) -> None:
         self._jobs = jobs
@@ -147,11 +152,12 @@ class LocalWorkers:
         return len(self._flying)
 
     def start(self, attempts: Sequence[Attempt], limit_s: float, alone: str = "") -> None:
-        """Start the flight of a mission, or of several that share it.
+        """Start a flight for one mission, or one flight that several missions share.
 
         Args:
-            limit_s: limit of the wall time of each mission, s.
-            alone: reason why a mission does not share a flight, for its record.
+            attempts: the missions, each with its changed fields and the attempt's own folder.
+            limit_s: wall time limit of each mission, in seconds.
+            alone: why the mission does not share a flight, for its record; may be empty.
 
         Raises:
             MavfiError: the processes cannot be started.
@@ -176,7 +182,7 @@ class LocalWorkers:
                 (folder / HALT).touch()
 
     def wait(self, timeout_s: float) -> list[AttemptEnd]:
-        """Wait for guards' messages or the time-out; return the missions that have ended."""
+        """Wait until a guard reports or `timeout_s` has passed. Return the attempts that ended."""
         ended = []
         for selected, _ in self._selector.select(timeout_s):
             channel = selected.fileobj
@@ -227,7 +233,7 @@ def _end_of_flight(message: Mapping[str, Any]) -> str:
 
 
 def _next_message(channel: socket.socket) -> Mapping[str, Any] | None:
-    """Receive a guard's next message; None if it has died or sends none in time."""
+    """Return a guard's next message, or None if the guard has died or does not send one in time."""
     with contextlib.suppress(OSError):
         if packet := channel.recv(PACKET):
             message: dict[str, Any] = json.loads(packet)
@@ -284,7 +290,7 @@ def _refused(kind: str, text: str) -> AttemptResult:
 
 
 def _cut_off(outcome: Outcome, reason: str, out: Path, config: MissionConfig) -> AttemptResult:
-    """Judge a mission whose process ended before it wrote its record."""
+    """Return how a mission counts whose process ended before it wrote its record."""
     runs = [path for path in out.glob("[!.]*/") if path.name != SCRATCH]
     run = runs[0] if len(runs) == 1 else None
     fault = None
@@ -318,7 +324,8 @@ class Cluster:
 
     Args:
         address: address of the scheduler, such as tls://host:8786.
-        keep: the policy that selects run folders to keep; the others are sent without traces.
+        keep: policy that selects the run folders to keep. Workers send the other run folders
+            without traces.
         keys: folder with the keys of the cluster; required for tls://.
 
     Raises:
@@ -345,7 +352,7 @@ class Cluster:
 
     @property
     def free(self) -> int:
-        """Number of flights that can be sent now; negative if threads have left."""
+        """Number of flights that can be sent now. Negative if the cluster has lost threads."""
         if time.monotonic() - self._looked_s > _LOOK_S:
             self._threads = sum(self._client.nthreads().values())
             self._looked_s = time.monotonic()
@@ -369,10 +376,10 @@ class Cluster:
         future.add_done_callback(partial(_put, self._done, self._submitted))
 
     def halt(self) -> None:
-        """Do nothing: flights on the cluster fly all their missions."""
+        """Do nothing, because flights on the cluster always fly all their missions."""
 
     def wait(self, timeout_s: float) -> list[AttemptEnd]:
-        """Wait for a flight's result or the time-out; return the missions that have ended."""
+        """Wait until a flight ends or `timeout_s` has passed. Return the attempts that ended."""
         flights = []
         with contextlib.suppress(queue.Empty):
             flights.append(self._done.get(timeout=timeout_s))
@@ -387,11 +394,14 @@ class Cluster:
             return [AttemptEnd(number=number, lost=lost) for number in outs]
         answer = future.result()
         if isinstance(answer, str):
-            raise CampaignStopped(f"a worker's versions differ: {answer}")
+            raise CampaignStopped(f"a worker's versions differ from those here: {answer}")
         return [_unpacked(ended, files, outs[ended.number]) for ended, files in answer]
 
     def close(self) -> None:
-        """Cancel missions that have not begun; results of missions in flight are dropped."""
+        """Cancel the missions that have not begun, and disconnect from the cluster.
+
+        The results of missions in flight are discarded.
+        """
         with contextlib.suppress(OSError, TimeoutError):  # the cluster may be gone
             self._client.cancel([future for future, _ in self._futures.values()])
         self._futures.clear()
@@ -403,7 +413,10 @@ def _put(done: queue.SimpleQueue[int], flight: int, _future: Future) -> None:
 
 
 def _unpacked(ended: AttemptEnd, files: Mapping[str, bytes], out: Path) -> AttemptEnd:
-    """Write a mission's files where a local mission would have written them."""
+    """Write the files that a worker sent into the attempt's folder, as a local mission would.
+
+    Return how the attempt ended; it is lost if the path of a file lies outside that folder.
+    """
     for name, data in files.items():
         path = out / name
         if ".." in Path(name).parts or not path.is_relative_to(out):
@@ -445,7 +458,9 @@ def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> N
             raise CampaignStopped(f"worker {worker} cannot fly missions: {versions!r}")
         differing = version_differences(ours, versions)
         if differing:
-            raise CampaignStopped(f"the versions of worker {worker} differ: {'; '.join(differing)}")
+            raise CampaignStopped(
+                f"the versions of worker {worker} differ from those here: {'; '.join(differing)}"
+            )
 
 
 _SMALL = (RESULT, FAULT)  # files that the runner reads from a run folder that is not kept
@@ -465,16 +480,17 @@ def _fly(
     task: str,
     versions: Mapping[str, str],
 ) -> str | list[tuple[AttemptEnd, dict[str, bytes]]]:
-    """Fly one mission, or several that share a flight.
+    """Fly one mission, or several that share a flight, on a worker of the cluster.
 
     Run folders that the campaign does not keep are sent without their traces.
 
     Args:
-        versions: the runner's versions.
+        versions: versions on the machine that runs the campaign.
 
     Returns:
-        How each mission ended, with its compressed files by path in its folder; or, if nothing was
-        flown, the differences between this worker's versions and the runner's.
+        For each mission, how it ended, and its compressed files keyed by their paths relative to
+        its folder. If this worker's versions differ, nothing is flown, and the result is a text
+        that lists the differences.
     """
     differing = version_differences(versions, _worker_versions())
     if differing:

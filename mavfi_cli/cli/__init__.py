@@ -47,14 +47,14 @@ _terminated: list[bool] = []  # by SIGTERM
 
 
 class _LazyGroup(click.Group):
-    """A group that imports a command's module when the command or its help is used."""
+    """The group of all commands. It imports a command's module when the command is first needed."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the commands' names in the order of the help page."""
         return list(_COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import the command's module; None if there is no such command."""
+        """Import the module of a command and return the command, or None for an unknown name."""
         if cmd_name not in _COMMANDS:
             return None
         module = _COMMANDS[cmd_name][0]
@@ -64,12 +64,12 @@ class _LazyGroup(click.Group):
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the list from the table, because importing every command would be slow."""
+        """Write the list of commands from a table, because importing every module would be slow."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete command names from the table, because importing every module would be slow."""
+        """Complete command names from a table, because importing every module would be slow."""
         items = [
             CompletionItem(name, help=text)
             for name, (_, text) in _COMMANDS.items()
@@ -80,17 +80,17 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Resolve as click does, but suggest the nearest name for an unknown command."""
+        """Find the command as click does, but suggest the nearest name if it does not exist."""
         if args and args[0] not in _COMMANDS and not args[0].startswith("-"):
             ctx.fail(str(UnknownName("command", args[0], _COMMANDS)))
         return super().resolve_command(ctx, args)
 
 
 class _VehicleSide(click.Command):
-    """A vehicle-side command, which a separate program carries out."""
+    """A command of the simulated vehicle, which runs as a separate program."""
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Ask the program for completions, except `mavfi sitl`, which would start flying."""
+        """Ask the program for completions, unless it is `mavfi sitl`, which would start flying."""
         from mavfi_cli.core.processes import PYTHON
 
         if self.name != "world":
@@ -108,7 +108,10 @@ class _VehicleSide(click.Command):
 
 
 def _vehicle_side(name: str, module: str) -> click.Command:
-    """Return a command that replaces this process by `python -m module`."""
+    """Return a command that replaces this process with `python -m MODULE`.
+
+    All arguments are passed on.
+    """
 
     def become(arguments: tuple[str, ...]) -> None:
         from mavfi_cli.core.processes import PYTHON
@@ -132,7 +135,7 @@ def cli() -> None:
 
 
 def main() -> NoReturn:
-    """Run the command line and exit.
+    """Run the command line and end the process with the command's exit code.
 
     An error prints one line and exits with code 1, a usage error with code 2. An unknown name is a
     usage error.
@@ -147,7 +150,7 @@ def main() -> NoReturn:
 
 
 def _interrupt(*_: object) -> NoReturn:
-    """End as after Ctrl-C, leaving no process and no temporary folder behind."""
+    """Handle SIGTERM like Ctrl-C, so that no process and no temporary folder is left behind."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     _terminated.append(True)
     raise KeyboardInterrupt

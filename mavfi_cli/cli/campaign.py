@@ -312,7 +312,7 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
         answer["campaign"], more = _planned(what, scale, options["changes"], options["worlds"])
         lines += more
     if not answer:
-        raise click.UsageError("name a campaign, --margin or --difference")
+        raise click.UsageError("name a campaign, or give --margin or --difference")
     echo_lines(json.dumps(answer, indent=2).split("\n") if as_json else lines)
 
 
@@ -333,7 +333,7 @@ def keys(folder: Path) -> None:
 def _planned(
     what: str, scale: float | None, changes: Sequence[str], worlds: str | None
 ) -> tuple[dict[str, Any], list[str]]:
-    """Describe the missions of a campaign: a dict for JSON, and lines of text."""
+    """Describe the missions that a campaign would fly. Return a dictionary, and lines of text."""
     from collections import Counter
 
     from mavfi_cli.campaigns.begin import chosen_spec, flyable

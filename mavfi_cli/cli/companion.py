@@ -65,7 +65,7 @@ def companion(
     mission = replace(mission, **given)
     CompanionParts.of(mission)  # rejects unknown names
     if (goal is None) == (briefing is None):
-        raise click.UsageError("give either --goal or --lockstep with a briefing")
+        raise click.UsageError("give exactly one of --goal X,Y,Z and --lockstep FILE")
     launch: StartVehicle = Vehicle.start
     if briefing is None:
         mission = replace(mission, link=link, goal=goal)

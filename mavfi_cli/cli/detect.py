@@ -43,7 +43,7 @@ def list_(models: Path | None, as_json: bool) -> None:
 
 
 def _entry(row: DetectorListing) -> dict[str, Any]:
-    """Return a detector's entry for `--json`, with its description under the key `told`."""
+    """Return the entry of a detector for `--json`, with its description under the key `told`."""
     entry = asdict(row)
     entry["told"] = entry.pop("description")
     return entry

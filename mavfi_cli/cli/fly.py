@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from mavfi_cli.spec.mission import MissionConfig
 
 _SOURCE = {"at", "exact_bits", "effect", "persistence", "duration_s", "together", "direction"}
-_DYING = "needs nodes that can die: --inject process.NODE, or --level instruction"
+_DYING = "has no effect unless a node can die: give --inject process.NODE or --level instruction"
 _EITHER = {"bits", "field", "fault_seed"}
 _OF_PROGRAM = {"objects", "function"}
 _INSTRUCTION = {"sites", "roles", "compat", *_OF_PROGRAM}
@@ -253,7 +253,11 @@ def fly(
 
 
 def _hint(run: Run) -> list[str]:
-    """Suggest a fault that moves a waypoint far, if this one changed little and did no harm."""
+    """Return lines that suggest a fault with a large effect, if this one had a tiny effect.
+
+    The list is empty unless the fault changed values by little and the mission succeeded, without a
+    detector and without --config.
+    """
     record = run.record
     changes = [change for strike in record.strikes for change in strike.changes]
     small = (
@@ -279,7 +283,11 @@ def _hint(run: Run) -> list[str]:
 
 
 def _mission_of(path: Path | None) -> MissionConfig:
-    """Return the mission in the file, or the default one, with the options applied.
+    """Return the configuration of the mission that the user's options describe.
+
+    Args:
+        path: TOML file of a mission, whose values the options override; None starts from the
+            defaults.
 
     Raises:
         ConfigError: the file or an option is not valid.
@@ -336,7 +344,7 @@ def _replaced(base: MissionConfig, given: Given) -> MissionConfig:
 
 
 def _refuse_unused_bits(fault: FaultConfig) -> None:
-    """Raise UsageError if an option chooses bits that the fault does not flip."""
+    """Raise UsageError if an option chooses bits that the fault does not flip, or a bit twice."""
     if fault.effect != "flip":
         refuse_given({"bits", "field", "exact_bits"}, f"has no effect with --effect {fault.effect}")
     if fault.exact_bits:
@@ -348,7 +356,10 @@ def _refuse_unused_bits(fault: FaultConfig) -> None:
 def _faults(
     base: MissionConfig, given: Given
 ) -> tuple[FaultConfig | None, InstructionConfig | None]:
-    """Return the mission's checked faults at source and at instruction level; one is None."""
+    """Return the source-level and the instruction-level fault of the mission, after checking them.
+
+    A mission has at most one fault, so at least one of the two is None.
+    """
     from mavfi_cli.attack.live import mission_strategy
     from mavfi_cli.mission.companion_faults import check_companion_fault
     from mavfi_cli.spec.companion import CompanionConfig
@@ -395,7 +406,11 @@ def _faults(
 
 
 def _recorded_fault(run: Path, companion: str | None) -> InstructionConfig:
-    """Return the configuration that repeats a recorded fault in a user's companion.
+    """Return the instruction-level fault that a run of a user's companion recorded.
+
+    Args:
+        run: the run folder.
+        companion: the user's companion in the new mission; None if it has none.
 
     Raises:
         RecordError: the run has no record of such a fault.
@@ -408,7 +423,9 @@ def _recorded_fault(run: Path, companion: str | None) -> InstructionConfig:
     others = _SOURCE | _EITHER | _INSTRUCTION | {"inject", "level"}
     refuse_given(others, "cannot be combined with --replay, which takes it from the record")
     if companion is None:
-        raise click.UsageError("--replay needs --companion; `mavfi replay` repeats other flights")
+        raise click.UsageError(
+            "--replay needs --companion; to repeat a flight without it, use `mavfi replay`"
+        )
     fault = structure(_record_of(run).get("request") or {}, InstructionConfig)
     fault.check_program(CompanionConfig.load(companion).program)
     return fault

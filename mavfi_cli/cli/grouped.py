@@ -14,7 +14,11 @@ from mavfi_cli.core.errors import ConfigError, MavfiError, PlaceError
 
 
 class _GroupedOption(click.Option):
-    """An option that the help shows in the section of its group."""
+    """An option that the help page lists in the section of its group.
+
+    Args:
+        group: title of the section.
+    """
 
     def __init__(self, *args: Any, group: str, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -26,7 +30,10 @@ Decorated = TypeVar("Decorated", bound=Callable[..., Any] | click.Command)
 
 
 def section(title: str) -> Callable[..., Callable[[Decorated], Decorated]]:
-    """Return a `click.option` whose options appear in this section and show their defaults."""
+    """Return a decorator like `click.option` whose options are listed in a section of the help.
+
+    The help shows the defaults of these options.
+    """
     return partial(click.option, cls=_GroupedOption, group=title, show_default=True)
 
 
@@ -34,10 +41,13 @@ option = section("Options")  # for commands without sections
 
 
 class GroupedCommand(click.Command):
-    """A command whose errors name the option at fault and whose help groups the options."""
+    """A command whose help lists options in sections and whose errors name the option at fault."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Call the command; turn an error in an option's value into a usage error naming it."""
+        """Run the command. Convert an error about an option's value into a usage error.
+
+        The message of the usage error names the option.
+        """
         if ctx.params.get("as_json") and ctx.params.get("as_csv"):
             raise click.UsageError("--json cannot be combined with --csv")
         try:
@@ -49,7 +59,7 @@ class GroupedCommand(click.Command):
             raise click.UsageError(f"{option}: {problem}") from None
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write one section per group, in the order of declaration."""
+        """Write one section per group of options, in the order in which they are declared."""
         sections: dict[str, list[tuple[str, str]]] = {}
         params = self.get_params(ctx)
         (*_, rest) = ("Options", *(p.group for p in params if isinstance(p, _GroupedOption)))
@@ -68,7 +78,7 @@ class GroupOfCommands(click.Group):
     command_class = GroupedCommand
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the list of commands."""
+        """Write the list of commands in alphabetical order, each with its first sentence."""
         with formatter.section("Commands"):
             formatter.write_dl(
                 [
@@ -79,7 +89,10 @@ class GroupOfCommands(click.Group):
 
 
 def _blamed(error: MavfiError) -> tuple[str, str]:
-    """Return the option or argument that caused an error, and the problem; or "", ""."""
+    """Return the option or argument that caused an error and the problem, or two empty strings.
+
+    The strings are empty if the cause is unknown.
+    """
     if isinstance(error, ConfigError) and error.key and not error.path:
         return spelling(error.key), error.problem
     if isinstance(error, PlaceError):  # it names the world, which is not at fault
@@ -95,7 +108,10 @@ def _blamed(error: MavfiError) -> tuple[str, str]:
 
 
 def given_options() -> Given:
-    """Return the options that the user gave to the current command, by parameter name."""
+    """Return the values of the options that the user gave to the current command.
+
+    They are keyed by parameter name. Options with default values are omitted.
+    """
     context = click.get_current_context()
     return {
         name: value
@@ -105,18 +121,23 @@ def given_options() -> Given:
 
 
 def given_fields(kind: type, **others: Any) -> Given:
-    """Return those options given by the user that are fields of a dataclass.
+    """Return the values of the options that the user gave and that are fields of a dataclass.
+
+    They are keyed by field name, as arguments for the dataclass.
 
     Args:
         kind: the dataclass, such as a plan.
-        others: further fields, which take precedence.
+        others: values of further fields, which replace the user's.
     """
     known = {field.name for field in fields(kind)}
     return {name: own for name, own in given_options().items() if name in known} | others
 
 
 def spelling(name: str) -> str:
-    """Return the current command's option for a parameter, such as `--v-max`; else the name."""
+    """Return how the user writes a parameter, such as `--v-max`, or the name itself if unknown.
+
+    The parameters are those of the current command.
+    """
     for param in click.get_current_context().command.params:
         if param.name == name or f"--{name}" in param.opts:
             return param.opts[0]
@@ -124,12 +145,20 @@ def spelling(name: str) -> str:
 
 
 def refuse_given(names: Collection[str], why: str) -> None:
-    """Raise UsageError if the user gave one of these options. The message is option and `why`."""
+    """Raise an error if the user gave one of these options.
+
+    Args:
+        names: parameter names of the options.
+        why: the end of the message, which begins with the option.
+
+    Raises:
+        click.UsageError: one of the options was given.
+    """
     for name in given_options():
         if name in names:
             raise click.UsageError(f"{spelling(name)} {why}")
 
 
 def names_in(text: str) -> tuple[str, ...]:
-    """Return the names in a comma-separated list."""
+    """Split a comma-separated list into names, without surrounding spaces and empty names."""
     return tuple(name.strip() for name in text.split(",") if name.strip())

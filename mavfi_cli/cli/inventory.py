@@ -1,4 +1,4 @@
-"""`mavfi doctor`, `platforms`, `stacks`, `states`: test this machine, and list what exists."""
+"""`mavfi doctor`, `platforms`, `stacks` and `states`: test this machine, list what mavfi ships."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _all_s(profile: PlatformProfile) -> float:
 
 
 def _kernel_lines(profile: PlatformProfile) -> Iterator[str]:
-    """Yield lines about the computer and each kernel, with the source of each number."""
+    """Yield lines of text about a platform and the latency of each kernel, with their sources."""
     if profile.measured_factor is not None:
         yield _title(profile)
         yield _MEASURED.format(
@@ -204,7 +204,7 @@ def _explained(stack: Stack) -> Iterator[str]:
 
 
 def _compared(stacks: Sequence[Stack]) -> Iterator[str]:
-    """Yield the keys in which stacks differ, one column per stack."""
+    """Yield the lines of a table of the keys in which stacks differ, with one column per stack."""
     for number, stack in enumerate(stacks, start=1):
         yield from textwrap.wrap(f"{number}  {_title(stack)}", WIDTH, subsequent_indent="   ",
                                  break_long_words=True)  # fmt: skip

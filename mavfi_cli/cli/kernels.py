@@ -225,7 +225,15 @@ def _variable(text: str) -> tuple[str, str]:
 def _replay_folder(
     folder: Path, kernels: tuple[str, ...], runs: int, program: ProgramTarget | None
 ) -> bool:
-    """Repeat recorded runs and print those that differ. Return True if none differs."""
+    """Repeat the runs recorded in a folder and print those that differ.
+
+    Return True if all repeated runs are identical to the recorded ones.
+
+    Args:
+        kernels: kernels whose runs are repeated; empty selects all built-in kernels.
+        runs: largest number of runs of each kernel; 0 repeats all.
+        program: the program whose runs are repeated, if they are not those of kernels.
+    """
     from mavfi_cli.attack.campaign import replay_runs
 
     equal = total = 0

@@ -21,12 +21,16 @@ if TYPE_CHECKING:
 
 PLAIN_EVERY_S, _REDRAW_S = 10.0, 0.05
 _NOTED = ("phase", "autopilot", "plan", "stop", "fault", "alarm", "node", "outcome")
-_MOST_SETTINGS = 6  # with more, rates are left out here; `campaign status` shows all
-_Part = str | tuple[str, str]  # text, or text and its style on a terminal
+_MOST_SETTINGS = 6  # with more settings, no rates are shown here; `campaign status` shows all
+_Part = str | tuple[str, str]  # text, or a text with its style on a terminal
 
 
 class _Lines:
-    """Prints plain lines: notes immediately, progress at most every ten seconds."""
+    """Prints notes at once, and progress as a plain line at most every ten seconds.
+
+    Args:
+        first_s: time of the earliest line of progress, in seconds after the start.
+    """
 
     def __init__(self, first_s: float) -> None:
         self._next_s, self._last_s = first_s, 0.0
@@ -44,7 +48,7 @@ class _Lines:
 
 
 class _LiveLine(_Lines):
-    """Rewrites one line in place, with notes scrolling above it."""
+    """Shows progress in one line that is rewritten in place. Notes scroll above it."""
 
     def __init__(self, live: Live) -> None:
         self._live, self._next_s = live, 0.0
@@ -66,7 +70,10 @@ class _LiveLine(_Lines):
 
 @contextmanager
 def _screen(first_s: float) -> Iterator[_Lines]:
-    """Choose live or plain progress for stderr. Plain progress begins after `first_s`."""
+    """Open a view of progress on stderr: a live line on a terminal, plain lines elsewhere.
+
+    Plain lines of progress begin after `first_s` seconds.
+    """
     if not sys.stderr.isatty():
         yield _Lines(first_s)
         return
@@ -125,7 +132,7 @@ class _MissionsView(Spectator):
         self._screen.update(", ".join(parts), progress.elapsed_s, last=last)
 
     def on_end(self, progress: Progress) -> None:
-        """Show the time that the missions took; nothing if none was flown."""
+        """Print how long the missions took, unless no mission was flown."""
         if flown := progress.over - progress.before:
             line = f"{flown} missions in {duration(progress.elapsed_s)}"
             line += f", {progress.rate_per_h:.0f} an hour"
@@ -141,14 +148,19 @@ class _MissionsView(Spectator):
 
 
 class _RunsView:
-    """Shows runs of isolated kernels: the kernel, the number of runs, and the time left."""
+    """Shows the progress of runs of isolated kernels, and the time left.
+
+    Args:
+        kernels: names of all kernels, in the order in which they run.
+        runs: number of runs of each kernel.
+    """
 
     def __init__(self, screen: _Lines, kernels: Sequence[str], runs: int) -> None:
         self._screen, self._kernels, self._runs = screen, list(kernels), runs
         self._begun_s, self._kernel = time.monotonic(), ""
 
     def show(self, kernel: str, done: int) -> None:
-        """Show the number of completed runs of a kernel."""
+        """Show that `done` runs of a kernel are complete."""
         if kernel != self._kernel:
             self._kernel = kernel
             self.note(f"{kernel}: golden run and profile")
@@ -160,7 +172,7 @@ class _RunsView:
         self._screen.update(text, elapsed_s, last=over == total)
 
     def stage(self, what: str) -> None:
-        """Show a step that precedes the first run of a kernel."""
+        """Show a step of the preparation that precedes the first run of a kernel."""
         self._screen.update(f"{self._kernel}: {what}", self._elapsed_s())
 
     def note(self, text: str) -> None:
@@ -173,14 +185,22 @@ class _RunsView:
 
 @contextmanager
 def runs_view(kernels: Sequence[str], runs: int) -> Iterator[_RunsView]:
-    """Show the runs of isolated kernels on stderr."""
+    """Show the progress of runs of isolated kernels on stderr, as a context manager.
+
+    Args:
+        kernels: names of all kernels, in the order in which they run.
+        runs: number of runs of each kernel.
+    """
     with _screen(PLAIN_EVERY_S) as screen:
         yield _RunsView(screen, kernels, runs)
 
 
 @contextmanager
 def progress_view(config: MissionConfig, *, quiet: bool) -> Iterator[Watcher]:
-    """Show the progress of one mission on stderr."""
+    """Show the progress of one mission on stderr, as a context manager.
+
+    It yields the watcher to pass to the mission. With `quiet`, the watcher shows nothing.
+    """
     if quiet:
         yield Watcher()
         return
@@ -192,7 +212,10 @@ def progress_view(config: MissionConfig, *, quiet: bool) -> Iterator[Watcher]:
 
 @contextmanager
 def missions_view(*, quiet: bool) -> Iterator[Spectator]:
-    """Show the progress of many missions on stderr."""
+    """Show the progress of many missions on stderr, as a context manager.
+
+    It yields the spectator to pass to the campaign. With `quiet`, the spectator shows nothing.
+    """
     if quiet:
         yield Spectator()
         return
@@ -202,7 +225,10 @@ def missions_view(*, quiet: bool) -> Iterator[Spectator]:
 
 @contextmanager
 def steps_view() -> Iterator[Callable[[str], None]]:
-    """Show the steps of a computation on stderr. Yields a function that takes a step's name."""
+    """Show the steps of a computation on stderr, as a context manager.
+
+    It yields a function to call with the name of each step when the step begins.
+    """
     begun_s = time.monotonic()
     with _screen(PLAIN_EVERY_S) as screen:
         yield lambda name: screen.update(f"{name} ...", time.monotonic() - begun_s)

@@ -17,7 +17,13 @@ def save(
     out: Path, contents: Mapping[str, object], tables: Mapping[str, str],
     pictures: Mapping[str, Figure],
 ) -> list[str]:  # fmt: skip
-    """Write JSON files, CSV files and pictures to a folder, by name; return the names.
+    """Write the results of a study to a folder, and return the names of the files.
+
+    Args:
+        out: the folder, which is created if it does not exist.
+        contents: the contents of JSON files, keyed by file name.
+        tables: the texts of CSV files, keyed by file name.
+        pictures: figures, keyed by file name.
 
     Raises:
         RecordError: a file cannot be written.
@@ -37,7 +43,13 @@ def save(
 
 
 def show(contents: Any, table: str, lines: Iterable[str], *, as_json: bool, as_csv: bool) -> None:
-    """Print a result as JSON, as CSV or as lines."""
+    """Print the result of a study as JSON, as CSV, or by default as lines of text.
+
+    Args:
+        contents: the result, as values that JSON can represent.
+        table: the result as CSV.
+        lines: the result as text.
+    """
     if as_json:
         echo(json.dumps(contents, indent=2, sort_keys=True))
     elif as_csv:

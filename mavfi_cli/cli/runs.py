@@ -119,7 +119,10 @@ def _repeat_run(
 
     run = load_run(path)
     if gdb and not (with_fault and run.record.config.get("instruction")):
-        raise click.UsageError("--gdb needs an instruction-level fault to stop at")
+        raise click.UsageError(
+            "--gdb needs a run with an instruction-level fault, "
+            "and cannot be combined with --without-fault"
+        )
     _warn_of_builds(run.record.versions)
     flown: Any = {"with_fault": with_fault, "firmware": firmware}
     config = run.mission(**flown)
@@ -186,7 +189,12 @@ def _repeat_mission(
 
 
 def _warn_of_builds(versions: Mapping[str, str]) -> None:
-    """Warn of components whose versions differ from the recorded ones; {} if none are known."""
+    """Print a warning for each program or library whose version differs from the recorded one.
+
+    Args:
+        versions: the recorded versions, keyed by name; empty if they are unknown, which gives no
+            warning.
+    """
     from mavfi_cli.core.installed import installed_versions, version_differences
 
     for text in version_differences(versions, installed_versions()) if versions else ():

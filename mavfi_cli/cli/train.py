@@ -72,7 +72,7 @@ def train(out: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     if logs:
         refuse_given(_FLYING | {"flown"}, "has no effect with --from")
         if options["log"] is None:
-            raise click.UsageError(f"{logs[0]} needs --from before it")
+            raise click.UsageError(f"{logs[0]}: the first log file must follow --from")
     if options["companion"] and flown is None and "worlds" not in given_options():
         raise click.UsageError("--companion needs --world")
     if not options["companion"]:

@@ -1,4 +1,4 @@
-"""Option types: bounded numbers, names that the shell completes, and run folders."""
+"""Types of command-line options: bounded numbers, names that the shell completes, run folders."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Vector3 = tuple[float, float, float]
 
 
 class _Place(click.ParamType[Vector3]):
-    """An option type for coordinates X,Y,Z (east, north, up), m."""
+    """The type of an option that takes coordinates X,Y,Z (east, north, up) in metres."""
 
     name = "text"
 
@@ -58,12 +58,16 @@ Names = str | Callable[[click.Context], Iterable[str]]
 
 
 class Name(click.ParamType[Any]):
-    """An option type for names that the shell completes. The command rejects unknown names.
+    """The type of an option that takes a name, which the shell can complete.
+
+    Unknown names are accepted here and rejected by the command.
 
     Args:
-        names: Sources of names: MODULE:ATTRIBUTE, or a function of the options given so far.
-        several: Names are separated by commas; the value is a tuple.
-        files: A path is accepted in place of a name.
+        names: Sources of the known names: `MODULE:ATTRIBUTE`, or a function that gets click's
+            context with the options given so far.
+        several: Whether the option takes several names, separated by commas. Its value is then a
+            tuple.
+        files: Whether the option takes a path in place of a name, too.
     """
 
     name = "text"
@@ -72,13 +76,16 @@ class Name(click.ParamType[Any]):
         self._names, self._several, self._files = names, several, files
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        """Return the name, or a tuple of names if there may be several."""
+        """Return the name unchanged, or a tuple of names if the option takes several."""
         return names_in(value) if self._several and isinstance(value, str) else value
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """Return the names that start with the typed text, or let the shell complete a path."""
+        """Return the known names that start with the typed text.
+
+        If no name does and the option takes files, let the shell complete a path.
+        """
         typed, comma, begun = incomplete.rpartition(",") if self._several else ("", "", incomplete)
         known = (_loaded(own) if isinstance(own, str) else own(ctx) for own in self._names)
         matches = [
@@ -90,7 +97,11 @@ class Name(click.ParamType[Any]):
 
 
 def _loaded(place: str) -> Iterable[str]:
-    """Return the names in MODULE:ATTRIBUTE: an enum, shipped files, plug-ins, or a container."""
+    """Import the object at `MODULE:ATTRIBUTE` and return the names that it contains.
+
+    The object may be an enumeration, whose values are the names; an object with an attribute
+    `names`, such as shipped files or plug-ins; or a container of names.
+    """
     module, _, attribute = place.partition(":")
     container: Any = getattr(importlib.import_module(module), attribute)
     if isinstance(container, EnumType):
@@ -100,7 +111,10 @@ def _loaded(place: str) -> Iterable[str]:
 
 
 def _worlds(_ctx: click.Context) -> Iterable[str]:
-    """Return the worlds' names by running `sitl.world`, which this side must not import."""
+    """Return the names of the worlds by running `sitl.world`.
+
+    It is not imported, because the companion's side must not depend on the vehicle's side.
+    """
     from mavfi_cli.core.processes import PYTHON
 
     line = [*PYTHON, "-m", "sitl.world", "list", "--json"]
@@ -157,7 +171,7 @@ _MOST = 1000  # most entries of a folder that completion reads
 
 
 class RunPath(click.Path):
-    """The path of a run folder."""
+    """The type of an argument that takes the path of a run folder, which the shell can complete."""
 
     def __init__(self) -> None:
         super().__init__(path_type=Path)
@@ -165,7 +179,10 @@ class RunPath(click.Path):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """Return the run folders, at most one level down, whose paths start with the text."""
+        """Return the run folders whose paths complete the typed text, at most one level down.
+
+        If there are none, complete paths as click does.
+        """
         matches = [CompletionItem(str(path)) for path in sorted(_runs(incomplete))]
         return matches or super().shell_complete(ctx, param, incomplete)
 

@@ -70,7 +70,10 @@ def view(run: Path, save: Path | None, layout: Path | None, as_json: bool) -> No
 
 
 def _golden(run: Run) -> Run | None:
-    """Return the golden flight of the pair; None if it cannot be flown."""
+    """Return the golden flight of a run with a fault, or None if it cannot be flown.
+
+    The golden flight is flown if it is not there yet.
+    """
     from mavfi_cli.mission.run import paired_golden
 
     try:
@@ -81,7 +84,7 @@ def _golden(run: Run) -> Run | None:
 
 
 def _again(run: Run) -> Recorder | None:
-    """Fly a run again and return its frames, clouds and maps; None if it cannot be repeated."""
+    """Fly a run again and return its depth frames, clouds and maps, or None if it cannot repeat."""
     from mavfi_cli.mission.run import watch_again
 
     try:

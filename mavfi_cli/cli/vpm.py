@@ -135,14 +135,15 @@ def vpm(
 
 
 def _overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, tuple[float, str]]:
-    """Return each detector's overhead in per cent and its source; later options take precedence.
+    """Return the overhead of each detector in per cent, and the source of this number.
 
     Args:
-        platform: name of the modelled platform; flights on others are ignored. None means any.
+        texts: values of the option `--overhead`. Later values replace earlier ones.
+        platform: name of the modelled platform; flights on others are ignored. None uses all.
 
     Raises:
-        click.UsageError: the text is neither DETECTOR=PERCENT nor a path.
-        RecordError: the path has no flights with a detector on the platform.
+        click.UsageError: a text is neither DETECTOR=PERCENT nor a path.
+        RecordError: a path has no flights with a detector on the platform.
     """
     overheads: dict[str, tuple[float, str]] = {}
     for text in texts:
@@ -160,7 +161,8 @@ def _overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str,
             overheads[name.strip()] = float(number), "--overhead"
         except ValueError:
             raise click.UsageError(
-                f"--overhead {text}: no such file or folder; for a percentage write aad=0.0062"
+                f"--overhead {text}: no such file or folder, and not DETECTOR=PERCENT, "
+                "such as aad=0.0062"
             ) from None
     return overheads
 

@@ -60,9 +60,9 @@ class LatencyModel:
         self._host_s: dict[str, list[float]] = {kernel: [] for kernel in KERNELS}
 
     def draw_s(self, kernel: str) -> float:
-        """Return the latency of a kernel's next invocation, s.
+        """Return the latency of a kernel's next invocation, in seconds.
 
-        On a measured platform, this is the latency of its newest invocation.
+        On a measured platform, return that of its newest invocation instead.
         """
         if self._profile.measured_factor is not None:
             assert self._wall is not None
@@ -73,7 +73,10 @@ class LatencyModel:
         return latency.latency_s * math.exp(latency.spread * float(drawn))
 
     def summary(self) -> MeasuredPlatform | None:
-        """Return the factor and the kernels' median times (s) of a measured platform, else None."""
+        """Return the factor and the median kernel times (in seconds) of a measured platform.
+
+        Return None if the platform's latencies are not measured in flight.
+        """
         factor = self._profile.measured_factor
         if factor is None:
             return None
@@ -90,12 +93,12 @@ class LatencyModel:
 
 
 class TurnOver(Exception):
-    """Raised to end a turn before its last node."""
+    """Raised inside a turn to end it before its last node has run."""
 
 
 @dataclass(slots=True, eq=False)
 class Node(Generic[In, Out]):
-    """A node: its kernel and its queue of length one."""
+    """A node of the executor: its kernel, its input queue of length one, and its process."""
 
     name: str
     kernel: Callable[[In, float], Out]
@@ -115,13 +118,13 @@ class Node(Generic[In, Out]):
 
     @types.coroutine
     def run(self, value: In) -> Generator[tuple[AnyNode, In], Out, Out]:
-        """Submit an input, and continue when its output takes effect."""
+        """Submit an input to the node. Return the output when it takes effect."""
         return (yield self, value)
 
 
 @dataclass(slots=True, eq=False)
 class _Job:
-    """An invocation from its start until its output takes effect."""
+    """One invocation of a node's kernel, from its start until its output takes effect."""
 
     node: AnyNode
     start_s: float
@@ -133,7 +136,7 @@ class _Job:
     output: Any = None
 
     def begin(self, wall: WallClock) -> None:
-        """Run the kernel, or send the input to the node's process, unless this was done before."""
+        """Run the kernel, or send the input to the node's process. Later calls do nothing."""
         if self.done or self.order is not None:
             return
         process = self.node.process
@@ -147,7 +150,7 @@ class _Job:
             self.input = None
 
     def settle(self, wall: WallClock) -> NodeLost | None:
-        """Wait for the output. Return the loss if the node's process was lost, otherwise None."""
+        """Wait for the output. If the node's process was lost, return the loss, otherwise None."""
         self.begin(wall)
         if not self.done:
             assert self.node.process is not None
@@ -165,15 +168,20 @@ class _Job:
 
 @dataclass(slots=True)
 class Executor:
-    """Runs nodes in simulated time on a number of cores.
+    """Runs nodes concurrently in simulated time, on a limited number of cores.
 
     Attributes:
-        draw_latency_s: Function from a node's name to the latency of its next invocation, s.
+        draw_latency_s: Function that returns the latency, in seconds, of the next invocation of
+            the node with the given name.
         cores: Maximum number of nodes that run at once; others wait in the order of their requests.
         compute_first: Start an invocation's computation before its latency is drawn.
-        restart_s: Simulated time from the end of a node's process until the new one is ready, s.
-        watchdog_s: Simulated time after which an unfinished invocation is killed, s.
-        on_start: Called with node, input and start stamp of each invocation.
+        restart_s: Simulated time, in seconds, from the end of a node's process until the new one is
+            ready.
+        watchdog_s: Simulated time, in seconds, after which an unfinished invocation is killed.
+        on_start: Called at the start of each invocation, with the node's name, the input and the
+            stamp.
+        losses: The lost processes so far.
+        timetable: The invocations so far, in order of start.
     """
 
     draw_latency_s: Callable[[str], float]
@@ -195,37 +203,37 @@ class Executor:
     _count: int = 0
 
     def add(self, node: Node[In, Out]) -> Node[In, Out]:
-        """Add a node. Its name selects its latency."""
+        """Add a node and return it. Its name selects the latency of its invocations."""
         self.nodes[node.name] = node
         return node
 
     def share_process(self, names: Sequence[str]) -> None:
-        """Let nodes share one single-threaded process whose loop runs them in this order."""
+        """Let the named nodes share one single-threaded process, which runs them in this order."""
         nodes = [self.nodes[name] for name in names]
         for place, node in enumerate(nodes):
             node.mates = nodes[place + 1 :] + nodes[:place]
 
     def stand_by(self, names: Sequence[str]) -> None:
-        """Give the processes of these nodes a hot standby.
+        """Give the process of each named node a hot standby.
 
-        The standby also processes every input, so it has the same state. When the process dies or
-        hangs, the standby's output takes effect instead, at the same time.
+        The standby also processes every input, so it has the same state as the process. When the
+        process dies or hangs, the standby's output takes effect instead, at the same time.
         """
         for name in names:
             for node in (self.nodes[name], *self.nodes[name].mates):
                 node.standby = True
 
     def process_of(self, name: str) -> dict[str, Callable[[Any, float], Any]]:
-        """Return the kernels that run in a node's process, by node name."""
+        """Return the kernels of a node and of the nodes that share its process, by node name."""
         node = self.nodes[name]
         return {member.name: member.kernel for member in (node, *node.mates)}
 
     def isolate(self, name: str, process: NodeProcess | None = None) -> None:
-        """Run the kernels of a node and its mates in a separate process until `close`.
+        """Run a node, and the nodes that share its process, in a separate process until `close`.
 
         Args:
-            process: Process that runs these kernels; by default a fork of this process, with a
-                copy of their state.
+            process: Process that runs the kernels of these nodes. By default it is a fork of this
+                process, with a copy of their state.
         """
         node = self.nodes[name]
         node.process = process or NodeProcess.fork(self.process_of(name))
@@ -257,7 +265,7 @@ class Executor:
         self._go_on(turn, None)
 
     def _go_on(self, turn: Turn, output: Any) -> None:
-        """Run a turn up to the next node that it awaits, and submit the input to that node."""
+        """Continue a turn with a node's output, and submit its next input to the node it awaits."""
         try:
             node, value = turn.send(output)
         except (StopIteration, TurnOver):
@@ -277,8 +285,8 @@ class Executor:
                 until then.
 
         Returns:
-            The output and the latency until it takes effect, s; None if the node is busy, down or
-            lost.
+            The output, and the latency in seconds until it takes effect. None if the node is busy
+            or down, or if its process is lost during this call.
         """
         if node.busy or (self.now_s < node.free_s - _SAME_S and not again):
             node.dropped += 1
@@ -306,7 +314,7 @@ class Executor:
         self.now_s = max(self.now_s, stamp_s)
 
     def compute(self) -> None:
-        """Begin the computation of all started invocations. May be called at any time."""
+        """Begin to compute the outputs of all started invocations. May be called at any time."""
         while self._uncomputed:
             self._uncomputed.pop(0).begin(self.wall)
 
@@ -341,7 +349,7 @@ class Executor:
         return _Job(node=node, start_s=self.now_s, input=value)
 
     def _book(self, job: _Job) -> float:
-        """Draw the latency of an invocation, and add the invocation to the timetable."""
+        """Draw an invocation's latency, add the invocation to the timetable, return the latency."""
         latency_s = self.draw_latency_s(job.node.name)
         job.node.busy_s += latency_s
         end_s = job.start_s + latency_s
@@ -377,7 +385,7 @@ class Executor:
     # Ends of processes
 
     def settle(self) -> None:
-        """Wait for all node processes to answer, so that host speed does not affect a fault."""
+        """Wait for all node processes to answer, so that the host's speed cannot affect a fault."""
         for job in self._jobs.values():
             if job.order is not None:
                 job.settle(self.wall)
@@ -391,7 +399,7 @@ class Executor:
                 node.process = None
 
     def kill(self, name: str) -> None:
-        """Treat a node's process as killed by SIGKILL. Do nothing if the node is down.
+        """Treat the process of a node as killed by SIGKILL. Do nothing if it is already down.
 
         Unless the node has a hot standby, its current input is lost, as in a crash. After the
         restart, the node continues with its newest waiting input.
@@ -418,7 +426,7 @@ class Executor:
         self._free_cores(len(jobs))
 
     def _take_over(self, node: AnyNode, loss: NodeLost) -> None:
-        """Replace a lost process with its standby, which has processed every earlier input."""
+        """Replace a lost process with its standby, which has processed all earlier inputs."""
         loss.node, loss.stamp_s = node.name, self.now_s
         self.losses.append(loss)
         if node.process is not None:
@@ -445,7 +453,10 @@ class Executor:
         self._free_cores(1)
 
     def _restart(self, node: AnyNode) -> None:
-        """Fork a new process. Its state is fresh, because its kernels never ran in this one."""
+        """Fork a new process for a node, and for the nodes that shared its lost process.
+
+        Its state is fresh, because its kernels never ran in this process.
+        """
         if node.process is not None:
             node.process.close(kill=True)
         members = (node, *node.mates)

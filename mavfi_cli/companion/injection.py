@@ -36,10 +36,10 @@ M = TypeVar("M")
 
 
 class NoInjection:
-    """Null object: a mission without a fault.
+    """The injection of a mission without a fault, and the base class of all others.
 
     Attributes:
-        injector: Strikes messages, memories and processes.
+        injector: Strikes messages, memory and processes when the fault is due.
         in_queue: True if the injection site is control's copy of the plan.
     """
 
@@ -49,28 +49,28 @@ class NoInjection:
         self.injector = NoInjector()
 
     def aim(self, shortest_flight_s: float, protection: NoProtection) -> None:
-        """Draw the parts of the fault that depend on the goal's distance and on the detector."""
+        """Draw the properties of the fault that depend on the goal's distance or the detector."""
 
     def begin(self, path: Path) -> None:
-        """Write the planned fault before the flight."""
+        """Write the record of the planned fault to `path`, before the flight."""
 
     def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
-        """Give the attacked node a process of its own before the flight."""
+        """Move the attacked node to a process of its own before the flight, if necessary."""
 
     def news(self) -> list[str]:
-        """Return the new lines about the fault since the last call."""
+        """Return the lines of text about the fault that are new since the last call."""
         return []
 
     def finish(self) -> Json | None:
-        """Write and return the record at the end of the mission; None without a fault."""
+        """Write and return the fault's record at the mission's end, or None without a fault."""
         return None
 
     def close(self) -> None:
-        """End the processes of the injection."""
+        """End all processes that the injection started."""
 
 
 class Killer(Injector):
-    """Decides when a fault strikes a process. It strikes once."""
+    """Decides when a fault strikes a process, and reports the strike. It strikes only once."""
 
     _awaits = "control tick"
 
@@ -79,7 +79,7 @@ class Killer(Injector):
         super().__init__(rng, config.trigger(), config.corruption(), shortest_flight_s, listener)
 
     def strike(self, moment: Moment) -> None:
-        """See `NoInjector`."""
+        """Report the strike to the listener if the fault is due."""
         if self._due(moment):
             self._record(moment, moment.tick, ())
 
@@ -106,7 +106,8 @@ class SourceInjection(NoInjection):
         """Draw the fault.
 
         Args:
-            shortest_flight_s: Length of the interval from which a random trigger time is drawn, s.
+            shortest_flight_s: Length, in seconds, of the interval from which a random trigger time
+                is drawn.
             protection: Protection whose detector the fault may corrupt.
 
         Raises:
@@ -144,18 +145,18 @@ class SourceInjection(NoInjection):
             self._units = {state.name: state.unit for state in fault.states}
 
     def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
-        """Move the node that will be killed to a process of its own."""
+        """Move the node that the fault will kill, if any, to a process of its own."""
         if self._config.killed_node is not None:
             self._executor = executor
             executor.isolate(self._config.killed_node)
 
     def begin(self, path: Path) -> None:
-        """Write the planned fault."""
+        """Write the record of the planned fault to `path`."""
         self._path = path
         self._write()
 
     def news(self) -> list[str]:
-        """Return a description of the first strike, once."""
+        """Return a description of the first strike, but only in the first call after it."""
         news, self._news = self._news, []
         return news
 
@@ -169,7 +170,7 @@ class SourceInjection(NoInjection):
             self._executor.kill(self._reader)
 
     def finish(self) -> Json | None:
-        """Write and return the record."""
+        """Write and return the fault's record at the end of the mission."""
         if self._state == "planned":
             self._state = "not_injected"
         return self._write()
@@ -212,10 +213,11 @@ class SourceInjection(NoInjection):
 
 
 class StruckNode(NoInjection):
-    """Injection of a fault that has already struck its node outside the flight.
+    """Injection of a fault that has already struck its node outside the flight, in a rehearsal.
 
     Attributes:
-        node, order: the node, and the number (from 1) of the request in which it was struck.
+        node: name of the struck node.
+        order: number, from 1, of the request to the node during which the fault struck.
         effect: what the fault did to the node, in one word.
         process: process that serves this request and all later ones; None if the fault left the
             node unchanged.
@@ -238,7 +240,7 @@ class StruckNode(NoInjection):
         self._news, self._text = [self._text] if self._text else [], ""
 
     def news(self) -> list[str]:
-        """See `NoInjection`."""
+        """Return the text about the fault once, after the node has answered or was lost."""
         news, self._news = self._news, []
         return news
 

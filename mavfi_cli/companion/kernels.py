@@ -25,7 +25,7 @@ from mavfi_cli.spec.stack import Stack
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlInput:
-    """Input of the controller.
+    """Input of the kernel `control`.
 
     Attributes:
         goes_on: True if control continues with its own copy of the plan, not the one in `inputs`.
@@ -38,7 +38,7 @@ class ControlInput:
 
 
 class Kernels:
-    """Kernels of all nodes. Each public method is one kernel: (input, start stamp) -> output."""
+    """The kernels of all nodes: methods that map an input and its start stamp to an output."""
 
     def __init__(
         self, config: MissionConfig, stack: Stack, planner: planners.Planner, briefing: Briefing
@@ -79,16 +79,16 @@ class Kernels:
         self._plans = 0  # plans counted by the planner
 
     def point_cloud(self, frame: DepthFrame, _stamp_s: float) -> PointCloud:
-        """Compute the world points of a depth frame."""
+        """Convert a depth frame to a point cloud in world coordinates."""
         return point_cloud.generate(frame, self._cloud_params)
 
     def octomap(self, cloud: PointCloud, _stamp_s: float) -> occupancy.MapSnapshot:
-        """Integrate a cloud into the map and return a snapshot."""
+        """Integrate a point cloud into the occupancy map, and return a snapshot of the map."""
         self._map.insert(cloud)
         return self._map.snapshot()
 
     def collision_check(self, inputs: collision.CollisionInputs, stamp_s: float) -> CollisionReport:
-        """Check a trajectory for collisions with the map."""
+        """Check a trajectory for collisions with the occupancy map."""
         read = replace(inputs, stamp_s=stamp_s, trajectory=self._as_read(inputs.trajectory))
         self._collision_state, report = collision.step(
             self._collision_state, read, self._collision_params
@@ -98,7 +98,7 @@ class Kernels:
     def planner(
         self, job: tuple[PlanRequest, occupancy.MapSnapshot], _stamp_s: float
     ) -> Trajectory | PlanFailure:
-        """Plan a trajectory for a request, or return the reason for a failure."""
+        """Plan a trajectory for a request. If planning fails, return the reason."""
         request, snapshot = job
         newest = request.trajectory_seq
         if self._stack.owns_sequence_numbers:
@@ -113,7 +113,7 @@ class Kernels:
         )
 
     def control(self, job: ControlInput, _stamp_s: float) -> Command:
-        """Run one control tick."""
+        """Run the controller for one tick, and return its command."""
         state = job.fresh or self._tracking_state
         if state is None:
             state = tracking.TrackingState(yaw_rad=job.yaw_rad, stamp_s=job.inputs.stamp_s)
@@ -139,7 +139,7 @@ class Kernels:
             self._plans = plans[-1].trajectory_seq
 
     def _as_read(self, trajectory: Trajectory | None) -> Trajectory | None:
-        """Return the plan that its readers use: without accelerations if feed-forward is off."""
+        """Return a trajectory as readers use it: without accelerations if feed-forward is off."""
         if trajectory is None or self._stack.feeds_acceleration_forward:
             return trajectory
         waypoints = trajectory.waypoints.copy()
@@ -148,5 +148,5 @@ class Kernels:
 
 
 def _next_int32(value: int) -> int:
-    """Increment a signed 32-bit counter. It wraps around, as it may have to after a fault."""
+    """Return `value` + 1, wrapped to a signed 32-bit integer. A fault may make it overflow."""
     return (value + 1 + 2**31) % 2**32 - 2**31

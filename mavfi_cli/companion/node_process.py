@@ -65,10 +65,13 @@ class NodeLost(Exception):
 
 
 class NodeProcess:
-    """Runs kernels for the executor: `order` sends an input, `take` returns its output.
+    """A process that runs kernels for the executor.
+
+    `order` sends an input to a kernel, and `take` returns the output.
 
     Args:
-        ending: Returns a description of the process's end if other code reaps it, otherwise None.
+        ending: If other code reaps the process, returns a description of how it ended; otherwise
+            returns None.
         answered: Called after each answer or loss, before the process gets another input; may be
             set later.
         patient: Never treat the process as hung, because a debugger may hold it.
@@ -96,7 +99,7 @@ class NodeProcess:
 
     @classmethod
     def fork(cls, runs: Mapping[str, Run]) -> NodeProcess:
-        """Fork this process into one that runs the given kernels, by node name."""
+        """Fork this process. The fork runs the given kernels, which are keyed by node name."""
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
 
         def child() -> int:
@@ -120,7 +123,7 @@ class NodeProcess:
 
     @property
     def next_number(self) -> int:
-        """Number of the next request."""
+        """The number that the next request will get."""
         return self._count + 1
 
     def rehearse(self, node: str, value: Any, start_s: float) -> None:
@@ -164,7 +167,7 @@ class NodeProcess:
         return self._answers.pop(number)
 
     def _cpu_s(self) -> float:
-        """Return the CPU time of the process in seconds; 0 after its end."""
+        """Return the CPU time that the process has used, in seconds, or 0 if it has ended."""
         try:
             return time.clock_gettime(~self.pid << 3 | 2)  # clock id of clock_getcpuclockid
         except OSError:
@@ -181,7 +184,11 @@ class NodeProcess:
         return "ended"
 
     def close(self, *, kill: bool = False) -> None:
-        """Close the connection, so that the process exits, and reap it. `kill` ends a stuck one."""
+        """Close the connection, so that the process exits, and reap it.
+
+        Args:
+            kill: Send the process SIGKILL, too, in case it is stuck.
+        """
         self._socket.close()
         if self._gone:
             return
@@ -221,7 +228,7 @@ class NodeProcess:
 
 
 class StruckNodeProcess(NodeProcess):
-    """A process that was struck outside the flight and is already working on its next request.
+    """A process that a fault struck outside the flight, and that is already working on a request.
 
     It is the child of another process, which reaps it later.
 
@@ -234,14 +241,14 @@ class StruckNodeProcess(NodeProcess):
         self._count, self._has_order = number, True
 
     def order(self, node: str, value: Any, start_s: float) -> int:
-        """See `NodeProcess`. The first call sends nothing: the process already has that request."""
+        """Send an input as `NodeProcess` does, but not the first, which the process already has."""
         if self._has_order:
             self._has_order = False
             return self._count
         return super().order(node, value, start_s)
 
     def _end_of_zombie(self) -> str | None:
-        """Wait until the process ends, and describe its end; return None if it has been reaped."""
+        """Wait until the process ends, and describe how. Return None if it was already reaped."""
         with contextlib.suppress(OSError):
             while True:
                 stat = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
@@ -259,20 +266,20 @@ class LostNode(NodeProcess):
         self.answered = lambda: None
 
     def order(self, node: str, value: Any, start_s: float) -> int:
-        """See `NodeProcess`."""
+        """Send nothing, and return 0 as the number of the request."""
         return 0
 
     def take(self, number: int) -> tuple[Any, float]:
-        """See `NodeProcess`."""
+        """Raise the loss."""
         self.answered()
         raise self._loss
 
     def close(self, *, kill: bool = False) -> None:
-        """See `NodeProcess`."""
+        """Do nothing, because no process is left."""
 
 
 def _described_end(status: int) -> str:
-    """Describe the end of a process, given its wait status."""
+    """Describe how a process ended, given its wait status."""
     if os.WIFSIGNALED(status):
         return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
     return f"ended with code {os.waitstatus_to_exitcode(status)}"

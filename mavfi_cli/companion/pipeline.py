@@ -59,7 +59,7 @@ CHECKED_STATES = {*FOLLOWED_STATES, *PLAN_STATES} - {"waypoint_yaw"}
 
 
 class _Withheld(TurnOver):
-    """Raised when the detector withholds a message."""
+    """Raised to end a turn when the detector withholds a message."""
 
     def __init__(self, decision: Decision) -> None:
         super().__init__()
@@ -68,7 +68,7 @@ class _Withheld(TurnOver):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Setpoint:
-    """A computed command and its inputs."""
+    """A command that control has computed, and the inputs from which it was computed."""
 
     due_s: float  # end of control's computation
     command: Command
@@ -80,7 +80,7 @@ class _Setpoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompanionParts:
-    """Stack, platform and planner of a mission, loaded by name."""
+    """The stack, platform and planner of a mission."""
 
     stack: Stack
     platform: PlatformProfile
@@ -88,7 +88,12 @@ class CompanionParts:
 
     @classmethod
     def of(cls, config: MissionConfig) -> CompanionParts:
-        """Load the parts of a mission. Raises UnknownName or ConfigError."""
+        """Load the stack, platform and planner that a mission names.
+
+        Raises:
+            UnknownName: One of them does not exist.
+            ConfigError: The file of one of them cannot be used.
+        """
         return cls(
             planner=planners.find(config.planner),
             platform=load_platform(config.platform),
@@ -97,11 +102,12 @@ class CompanionParts:
 
 
 class Companion:
-    """Perception, planning and control of one mission.
+    """The companion of one mission: perception, planning and control.
 
     Attributes:
         plan_failures: Number of failed plans for each reason that the planner gave.
-        reactions: Stamps of depth frames, each with that of the first setpoint that depends on it.
+        reactions: Stamps of depth frames, each with the stamp of the first setpoint that depends
+            on the frame.
     """
 
     def __init__(
@@ -168,12 +174,12 @@ class Companion:
     # Perception
 
     def take_frame(self, frame: DepthFrame) -> None:
-        """Handle a new depth image."""
+        """Start perception of a new depth frame."""
         self._frame = frame
         self.executor.start(self._see(frame))
 
     async def _see(self, frame: DepthFrame) -> None:
-        """Add a frame to the map, and check the active plan against the new map."""
+        """Add a depth frame to the map, and check the active plan against the new map."""
         cloud = self.publish(await self._point_cloud.run(frame))
         self._map = self.publish(await self._octomap.run(cloud))
         await self._check()
@@ -203,7 +209,7 @@ class Companion:
         self._follower.read(report, "mission logic", self._now_s, read)
 
     def _see_again(self) -> None:
-        """Recompute perception from the newest frame."""
+        """Repeat perception of the newest depth frame."""
         if self._frame is not None:
             self.executor.start(self._see(self._frame))
 
@@ -227,7 +233,7 @@ class Companion:
     # Control
 
     def tick(self, state: VehicleState) -> Command | None:
-        """Run one control tick in flight. Return the command to send now; None if there is none.
+        """Run one control tick in flight. Return the command to send now, or None before the first.
 
         The caller must call `executor.advance` before and `executor.compute` after it.
         """
@@ -260,7 +266,7 @@ class Companion:
         """Compute a command, due after control's latency. Return None if control is busy or down.
 
         Args:
-            fresh: State from which the controller starts; None for its own.
+            fresh: State from which the controller starts. If None, it continues from its own.
         """
         assert self._state is not None
         followed = inputs.trajectory
@@ -308,8 +314,8 @@ class Companion:
         """Recompute a withheld command, in this tick if the platform is fast enough.
 
         If a recomputation did not help, or the waypoint is at fault, drop the waypoint and start
-        from a fresh state. After ATTEMPTS recomputations in vain, the last command holds until the
-        next tick.
+        from a fresh state. After ATTEMPTS unsuccessful recomputations, the last command holds until
+        the next tick.
         """
         if self._fresh_frame_s is None:
             self._fresh_frame_s = setpoint.frame_s  # no setpoint has used it yet
@@ -372,9 +378,9 @@ class Companion:
     def _strike_memory(self) -> Trajectory | None:
         """Let a fault strike memory, then have the detector judge the active plan before its use.
 
-        Return control's copy of the plan if only the copy was corrupted; it lasts for this tick.
-        If control owns its queue, its copy is the active trajectory, because control passes the
-        rest of it to the other nodes.
+        Return control's copy of the plan, to be used in this tick only, if the fault corrupted just
+        this copy; otherwise return None. If control owns its queue, its copy is the active
+        trajectory, because control passes the rest of it to the other nodes.
         """
         active, moment, copy = self.pilot.active, self._moment(), None
         self._injector.strike(moment)
@@ -390,7 +396,10 @@ class Companion:
         return copy
 
     def _follow(self, copy: Trajectory | None) -> None:
-        """Note for the fault's follower that control reads the current waypoint and next yaw."""
+        """Report to the fault's follower that control reads the current waypoint and next yaw.
+
+        Also report which messages are still in use.
+        """
         follower, active = self._follower, self.pilot.active
         if not follower.waits:
             return
@@ -411,14 +420,17 @@ class Companion:
             self._map = MapSnapshot.empty(self._config.map_resolution_m)
 
     def _planner_is_up(self) -> None:
-        """Repeat the lost request unless a newer one is waiting."""
+        """After a restart of the planner, repeat its lost request unless a newer one is waiting."""
         if not self._stack.restores_counters:
             self._heard_seq = 0
         if self._planner.pending is None:
             self.pilot.plan_lost()
 
     def _control_is_up(self) -> None:
-        """Have the pilot request a new plan if control owns its queue."""
+        """After a restart of control, have the pilot request a new plan if control owns its queue.
+
+        Otherwise control still receives the plan in every tick.
+        """
         if self._stack.control_owns_queue and self._state is not None:
             self._queued = None
             self.pilot.control_lost(self._state)
@@ -441,7 +453,7 @@ class Companion:
 
     @property
     def tracked(self) -> tuple[Trajectory, int] | None:
-        """The tracked trajectory and the index of its current waypoint; None without one."""
+        """The tracked trajectory and the index of its current waypoint, or None without a plan."""
         trajectory = self.pilot.active.trajectory
         if trajectory is None or not len(trajectory.waypoints):
             return None

@@ -40,7 +40,7 @@ ANNOUNCED_EVERY_S = 1.0  # minimum time between two announced alarms of one stag
 
 
 class Response(Enum):
-    """The gate's decision about a message."""
+    """What the gate does with a message."""
 
     PASS = "pass"
     RECOMPUTE = "recompute"  # withheld; its stage is recomputed
@@ -61,7 +61,7 @@ class _Outage:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decision:
-    """Decision about a message, and the alarm that caused it."""
+    """The gate's decision about one message, and the alarm that caused it, if any."""
 
     response: Response
     alarm: Alarm | None = None
@@ -80,42 +80,49 @@ PASSED = Decision(response=Response.PASS)
 
 
 class NoProtection:
-    """Null object that lets every message pass."""
+    """The protection of a mission without a detector: it lets every message pass."""
 
     gate: Gate | None = None
 
     def report(self, report: CollisionReport, stamp_s: float) -> Decision:
-        """Judge a collision report when it arrives."""
+        """Decide whether a collision report that has just arrived takes effect."""
         return PASSED
 
     def plan(self, plan: Trajectory, stamp_s: float) -> Decision:
-        """Judge a plan when it arrives."""
+        """Decide whether a plan that has just arrived takes effect."""
         return PASSED
 
     def lose_plan(self) -> None:
-        """Note that the planner has answered without a usable plan."""
+        """Handle an answer of the planner that contains no usable plan."""
 
     def ahead(self, plan: Trajectory, first: int, only: int | None, stamp_s: float) -> Decision:
-        """Judge the active plan from waypoint `first` to its end, or only waypoint `only`."""
+        """Decide whether the active plan may be used from waypoint `first` to its end.
+
+        Args:
+            only: Ignore an alarm at any other waypoint. If None, an alarm at any waypoint counts.
+        """
         return PASSED
 
     def tick(
         self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
     ) -> Decision:
-        """Judge the current waypoint and the command."""
+        """Decide whether the command of a control tick takes effect.
+
+        It is judged with the current waypoint, which has the given index in the trajectory.
+        """
         return PASSED
 
     def news(self) -> list[str]:
-        """Return the new lines to announce since the last call."""
+        """Return the lines of text about alarms that are new since the last call."""
         return []
 
     def summary(self) -> Detection | None:
-        """Return checks, alarms and recoveries; None without a detector."""
+        """Return the record of checks, alarms and recoveries, or None without a detector."""
         return None
 
 
 class Protection(NoProtection):
-    """A gate with its counters.
+    """The protection of a mission with a detector: a gate that judges and counts messages.
 
     Args:
         wall: Accumulates the host time of all checks under "gate".
@@ -136,22 +143,26 @@ class Protection(NoProtection):
         self._announced_s: dict[Stage, float] = {}
 
     def report(self, report: CollisionReport, stamp_s: float) -> Decision:
-        """Judge a collision report when it arrives."""
+        """Decide whether a collision report that has just arrived takes effect."""
         alarm = self._judge("report", self.gate.judge_report, report)
         return self._decide(alarm, "report", Stage.PERCEPTION, stamp_s, self.gate.accept_report)
 
     def plan(self, plan: Trajectory, stamp_s: float) -> Decision:
-        """Judge a plan when it arrives."""
+        """Decide whether a plan that has just arrived takes effect."""
         alarm = self._judge("plan", self.gate.judge_plan, plan)
         accept = partial(self.gate.accept_plan, plan)
         return self._decide(alarm, "plan", Stage.PLANNING, stamp_s, accept, proven=False)
 
     def lose_plan(self) -> None:
-        """Note that the planner has answered without a usable plan."""
+        """Handle an answer of the planner that contains no usable plan."""
         self.gate.lose_plan()
 
     def ahead(self, plan: Trajectory, first: int, only: int | None, stamp_s: float) -> Decision:
-        """Judge the active plan from waypoint `first` to its end, or only waypoint `only`."""
+        """Decide whether the active plan may be used from waypoint `first` to its end.
+
+        Args:
+            only: Ignore an alarm at any other waypoint. If None, an alarm at any waypoint counts.
+        """
         alarm = self._judge("ahead", self.gate.judge_ahead, plan, first)
         if alarm is None or only not in (None, alarm.waypoint):
             return PASSED
@@ -160,7 +171,10 @@ class Protection(NoProtection):
     def tick(
         self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
     ) -> Decision:
-        """Judge the current waypoint and the command."""
+        """Decide whether the command of a control tick takes effect.
+
+        It is judged with the current waypoint, which has the given index in the trajectory.
+        """
         alarm = self._judge("tick", self.gate.judge_tick, trajectory, index, command)
         stage = Stage.CONTROL if alarm is None else alarm.stage
         flown = Stage.PLANNING in self.gate.fresh
@@ -255,12 +269,12 @@ class Protection(NoProtection):
             outage.since_s = None
 
     def news(self) -> list[str]:
-        """Return the new lines to announce since the last call."""
+        """Return the lines of text about alarms that are new since the last call."""
         news, self._news = self._news, []
         return news
 
     def summary(self) -> Detection:
-        """Return checks, alarms and recoveries."""
+        """Return the record of checks, alarms and recoveries."""
         return Detection(
             detector=self._config.name,
             protect=self._config.protect,
@@ -277,13 +291,19 @@ class Protection(NoProtection):
 
     @staticmethod
     def is_compiled(config: DetectorConfig, stack: str) -> bool:
-        """Return True if a gate's kernels are compiled. Otherwise `warm_up` takes many seconds."""
+        """Return True if the code of a detector's gate is compiled.
+
+        If it is not, `warm_up` takes many seconds.
+        """
         judge = getattr(config.build(stack), "tick_judge", None)
         return in_cache(judge or take_tick)
 
     @staticmethod
     def warm_up(config: DetectorConfig, stack: str) -> None:
-        """Load and compile all code of a gate. Raises what `DetectorConfig.build` raises."""
+        """Load and compile all code that a detector's gate needs, before the flight.
+
+        Raises the same errors as `DetectorConfig.build`.
+        """
         gate = Gate(config.build(stack))
         report = CollisionReport(
             stamp_s=0.0, collision=False, time_to_collision_s=math.inf, future_collision_seq=0
@@ -304,7 +324,7 @@ class Protection(NoProtection):
 
 
 class Recovery:
-    """Acts on the pilot and its active plan after alarms.
+    """Responds to the gate's alarms by acting on perception, the pilot and its active plan.
 
     Attributes:
         state: Newest vehicle state, from which a holding vehicle replans.
@@ -325,7 +345,10 @@ class Recovery:
         self.state: VehicleState | None = None
 
     def recover(self, withheld: Message, decision: Decision) -> None:
-        """Start the recovery from a withheld message. The sender of a command recomputes it."""
+        """Start the recovery after the gate has withheld a message.
+
+        A withheld command is recomputed by its sender, not here.
+        """
         self._follower.withheld(withheld)
         if isinstance(withheld, Trajectory):
             self._pilot.reject_plan()
@@ -357,7 +380,11 @@ class Recovery:
         self._judged = (active.trajectory, at)
 
     def judge_ahead(self, stamp_s: float, only: int | None = None) -> None:
-        """Judge the plan ahead. Drop or correct its anomalous waypoints before they are used."""
+        """Judge the active plan ahead. Drop or correct anomalous waypoints before they are used.
+
+        Args:
+            only: As for `Protection.ahead`.
+        """
         active = self._pilot.active
         while (flown := active.trajectory) is not None:
             decision = self._protection.ahead(flown, active.waypoint, only, stamp_s)
@@ -377,7 +404,7 @@ class Recovery:
             return
 
     def drop(self, flown: Trajectory, waypoint: int) -> Trajectory:
-        """Return `flown` without a waypoint. If `flown` is the active plan, replace it."""
+        """Return `flown` without one waypoint. If `flown` is the active plan, replace that plan."""
         bridged = without_waypoint(flown, waypoint)
         self._replace(flown, bridged)
         return bridged

@@ -1,4 +1,4 @@
-"""Packs dataclasses with arrays into bytes, as numpy's `.npz`; reading them executes no code.
+"""Packs dataclasses with arrays into bytes, as numpy's `.npz`. Reading them executes no code.
 
 An archive has two arrays of bytes. `value` is JSON, in which an array is given by its offset in
 `data`, dtype, shape, order and writeability. An array that occurs twice is stored once. Equal
@@ -38,15 +38,21 @@ _SHAPES: Mapping[str, tuple[int | None, ...]] = {
     "durations_s": (_MANY,),
     "trace": (_MANY,),
 }  # fmt: skip
-"""Shape of each array, by the name of its field."""
+"""Required shape of the array in each field, by the name of the field."""
 
 
 def pack(value: Any) -> bytes:
-    """Return an archive of a dataclass of numbers, strings, arrays, bytes and other dataclasses."""
+    """Pack a dataclass into an archive and return its bytes.
+
+    Fields may contain numbers, strings, arrays, bytes and other dataclasses.
+    """
     data, places = bytearray(), dict[int, dict[str, Any]]()
 
     def place(item: Any) -> Any:
-        """Convert a value that JSON lacks."""
+        """Convert a value that JSON cannot represent: a numpy scalar, an array or bytes.
+
+        An array is appended to the data, and replaced by its offset and properties.
+        """
         if isinstance(item, np.generic):
             return item.item()
         if id(item) not in places:
@@ -65,7 +71,10 @@ def pack(value: Any) -> bytes:
 
 
 def unpack(archive: bytes, kind: type[T]) -> T:
-    """Return the dataclass in an archive.
+    """Unpack an archive that `pack` made, and return the dataclass in it.
+
+    Args:
+        kind: The class of the dataclass.
 
     Raises:
         ValueError: The bytes are not an archive of this dataclass.
@@ -79,7 +88,10 @@ def unpack(archive: bytes, kind: type[T]) -> T:
         known: dict[Any, Any] = {}
 
         def array(item: dict[str, Any]) -> Any:
-            """Return the array at an offset; all references share it."""
+            """Convert a JSON object that stands for an array to the array.
+
+            Objects that stand for the same array share it. Other objects are returned unchanged.
+            """
             if _MARK not in item:
                 return item
             at, dtype, shape, order, writeable = item[_MARK]
@@ -114,7 +126,11 @@ def _converter() -> cattrs.Converter:
         )
 
         def hook(value: Any, kind: Any) -> Any:
-            """Build the dataclass. Raises ValueError if an array in it has the wrong shape."""
+            """Create the dataclass from its values.
+
+            Raises:
+                ValueError: An array in it has the wrong shape.
+            """
             made = make(value, kind)
             for name, shape in _SHAPES.items():
                 array = getattr(made, name, None)
@@ -129,7 +145,12 @@ def _converter() -> cattrs.Converter:
 
 def _as_it_is(*kinds: type) -> Any:
     def hook(value: Any, _: Any) -> Any:
-        """Return the value. Raises TypeError for a wrong type, ValueError if it exceeds 64 bits."""
+        """Return the value unchanged if it is valid.
+
+        Raises:
+            TypeError: The value has the wrong type.
+            ValueError: The value is an integer that does not fit in 64 bits.
+        """
         if isinstance(value, bool) is not (kinds[0] is bool) or not isinstance(value, kinds):
             raise TypeError(f"must be of type {kinds[0].__name__}, got {value!r}")
         if isinstance(value, int) and not -(2**63) <= value < 2**63:

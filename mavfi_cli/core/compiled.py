@@ -31,13 +31,13 @@ TARGET = "x86-64-v3"
 
 
 def compiled(function: F) -> F:
-    """Compile `function` and cache the machine code on disk.
+    """Return a version of `function` that numba compiles when it is first called.
 
-    The code uses IEEE arithmetic without reordering, and no threads.
+    The machine code is cached on disk. It uses IEEE arithmetic without reordering, and no threads.
 
     numba's cache checks the source file of a function, but not the files of the functions that
-    were compiled into it. Here a cache entry's stamp covers all sources in the folder of the
-    function and of all compiled functions that it can reach. Outdated code is never run.
+    were compiled into it. Here the stamp of a cache entry covers all sources in the folder of the
+    function and in those of all compiled functions that it can reach. Outdated code is never run.
     """
     numba = _numba()
     dispatcher = numba.njit(cache=True, error_model="numpy")(function)
@@ -68,9 +68,10 @@ def processor_level() -> str:
 
 
 def in_cache(kernel: Callable[..., Any]) -> bool:
-    """Return True if a call of a compiled function would load its machine code from disk.
+    """Return True if a call of a compiled function would not have to compile it.
 
-    Also return True if compilation is disabled (NUMBA_DISABLE_JIT), because then no call compiles.
+    This is the case if its machine code is in the cache on disk, or if compilation is disabled
+    (NUMBA_DISABLE_JIT).
     """
     cache_file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
     try:
@@ -80,10 +81,10 @@ def in_cache(kernel: Callable[..., Any]) -> bool:
 
 
 def _load_without_compiler(cache: Any) -> None:
-    """Make numba load machine code without its compiler, and recompile damaged cache entries.
+    """Let numba load cached machine code without its compiler, and recompile damaged cache entries.
 
-    Otherwise numba would load its whole compiler, in 0.4 s, before it checks the cache. Machine
-    code needs only the runtime. If something is compiled, the compiler loads what it needs.
+    Otherwise numba would load its whole compiler, which takes 0.4 s, before it checks the cache.
+    Machine code needs only the runtime. If something is compiled, the compiler loads what it needs.
     """
     from numba.core.runtime import rtsys
 
@@ -100,7 +101,7 @@ def _load_without_compiler(cache: Any) -> None:
 
 
 def _numba() -> Any:
-    """Import numba, but not BLAS, which no kernel uses and which takes 0.14 s to load."""
+    """Import numba and return it. Do not load BLAS: it takes 0.14 s, and no kernel uses it."""
     choose_caches()  # before numba reads the environment
     import numba
 
@@ -116,9 +117,9 @@ def _numba() -> Any:
 
 
 def _reached(function: Any) -> list[Any]:
-    """Return a function, and the Python functions behind all compiled functions it can reach.
+    """Return the function and the Python function behind each compiled function that it can reach.
 
-    It can reach those in its module, own or imported, and what they can reach in turn.
+    It can reach those that its module defines or imports, and what they can reach in turn.
     """
     reached = [function]
     for known in reached:
@@ -132,9 +133,11 @@ def _reached(function: Any) -> list[Any]:
 
 @functools.cache
 def folder_digest(folder: Path, *, deep: bool = False) -> str:
-    """Return the SHA-256 of the names and contents of all Python sources in a folder.
+    """Return the SHA-256 of the names and contents of all Python files in a folder, in hexadecimal.
 
-    `deep` adds its subfolders and all TOML files: worlds, vehicles, stacks, platforms and others.
+    Args:
+        deep: also include the files in subfolders, and all TOML files: worlds, vehicles, stacks,
+            platforms and others.
     """
     digest = hashlib.sha256()
     paths = [*folder.rglob("*.py"), *folder.rglob("*.toml")] if deep else folder.glob("*.py")
@@ -145,7 +148,10 @@ def folder_digest(folder: Path, *, deep: bool = False) -> str:
 
 
 def own_digest() -> str:
-    """Return the SHA-256 of all sources and settings of mavfi and of the simulated vehicle."""
+    """Return the SHA-256 of all Python and TOML files of mavfi and of the simulated vehicle.
+
+    The digest is in hexadecimal.
+    """
     parts = [folder_digest(folder, deep=True) for folder in (PACKAGE, PACKAGE.parent / "sitl")]
     return hashlib.sha256("".join(parts).encode()).hexdigest()
 
@@ -155,7 +161,7 @@ def own_digest() -> str:
 
 @functools.cache
 def choose_caches() -> None:
-    """Choose other cache folders if the default ones, such as another user's, are not writable.
+    """Choose cache folders for numba and matplotlib if the default ones are not writable.
 
     Machine code stays next to the sources if their folder is writable. Otherwise it goes to
     XDG_CACHE_HOME/mavfi, or else to a private temporary folder, whose path is printed to stderr
@@ -174,13 +180,19 @@ def choose_caches() -> None:
 
 
 def _home(variable: str, name: str) -> Path:
-    """Return the user's folder for an XDG variable; a relative path if the home is unknown."""
+    """Return the folder in an XDG environment variable, or the folder `name` in the user's home.
+
+    The path is relative if the user's home is unknown.
+    """
     given = Path(os.environ.get(variable, ""))
     return given if given.is_absolute() else Path(os.path.expanduser("~"), name)
 
 
 def _folder() -> Path:
-    """Return the folder for both caches: the first candidate that is writable."""
+    """Return the folder for the caches of numba and matplotlib.
+
+    It is XDG_CACHE_HOME/mavfi if that is writable, otherwise a private temporary folder.
+    """
     home = _home("XDG_CACHE_HOME", ".cache") / "mavfi"
     if home.is_absolute() and can_write(home):
         return home
@@ -202,7 +214,7 @@ def _folder() -> Path:
 
 
 def can_write(folder: Path) -> bool:
-    """Return True if a folder is writable, or can be created."""
+    """Return True if files can be created in the folder, which need not exist yet."""
     place = folder.absolute()
     while place != place.parent and not os.path.lexists(place):
         place = place.parent

@@ -1,4 +1,7 @@
-"""Loads TOML into frozen dataclasses and writes it. Types are strict; unknown keys are errors."""
+"""Reads TOML files into frozen dataclasses, and writes TOML.
+
+Types are strict, and unknown keys are errors.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ T = TypeVar("T")
 
 
 def load_toml(path: Path, cls: type[T]) -> T:
-    """Read a TOML file into the frozen dataclass `cls`.
+    """Read a TOML file and return an instance of the dataclass `cls` with its values.
 
     Raises:
         ConfigError: The file cannot be read or parsed, a key is missing or unknown, a value has the
@@ -32,9 +35,9 @@ def load_toml(path: Path, cls: type[T]) -> T:
 
 
 def read_toml(path: Path) -> tuple[dict[str, Any], str]:
-    """Parse a TOML file. Return its data and its text.
+    """Parse a TOML file. Return its values as a dictionary, and its text.
 
-    `structure` uses the text to find the line of an error.
+    `structure` needs the text to find the line of an error.
 
     Raises:
         ConfigError: The file cannot be read or parsed. The message names file and line.
@@ -44,7 +47,15 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def parse_toml(text: str, path: Path) -> dict[str, Any]:
-    """Parse TOML. ConfigErrors name `path`, and the line if the parser reports one."""
+    """Parse TOML text and return its values.
+
+    Args:
+        path: The file that the text comes from, for error messages.
+
+    Raises:
+        ConfigError: The text is not TOML. The message names the file, and the line if the parser
+            reports it.
+    """
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -56,7 +67,7 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
 
 
 def toml_text(values: Mapping[str, Any]) -> str:
-    """Return TOML text that reads back as equal values. Empty tables are left out.
+    """Convert values to TOML text that reads back as equal values. Empty tables are omitted.
 
     Args:
         values: Strings, finite numbers, booleans, arrays of them, tables, and arrays of tables.
@@ -76,22 +87,27 @@ def _without_empty_tables(values: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Shipped:
-    """The TOML files of one kind that ship with mavfi, in one folder."""
+    """The TOML files of one kind that ship with mavfi, such as its platforms.
+
+    Attributes:
+        kind: Word for such a file in error messages.
+        folder: The folder that contains the files.
+    """
 
     kind: str
     folder: Path
 
     @property
     def names(self) -> list[str]:
-        """Names of the files in alphabetical order."""
+        """The names of the files without their suffix, in alphabetical order."""
         return sorted(path.stem for path in self.folder.glob("*.toml"))
 
     def path(self, name_or_path: str) -> Path:
-        """Return the path of a shipped file, given by name, or of a user's file, given by path.
+        """Return the path of a shipped file that is given by name, or of a file given by path.
 
         Raises:
-            UnknownName: No shipped file has this name, and it is not a path to a TOML file.
-            ConfigError: It is a path to a TOML file that does not exist.
+            UnknownName: No shipped file has this name, and it does not end in `.toml`.
+            ConfigError: It ends in `.toml`, and there is no such file.
         """
         path = Path(name_or_path)
         if path.suffix != ".toml":
@@ -103,10 +119,14 @@ class Shipped:
         return path
 
     def base(self, name: object, path: Path) -> str:
-        """Return the `base` of a file if it names another shipped file.
+        """Return `name`, the value of `base` in a file, after checking that it is a shipped file.
+
+        Args:
+            name: Value of the key `base`.
+            path: The file that contains the key.
 
         Raises:
-            ConfigError: It names no other shipped file. The message suggests the nearest name.
+            ConfigError: No other shipped file has this name. The message suggests the nearest name.
         """
         if name not in self.names or path == self.folder / f"{name}.toml":
             error = UnknownName(self.kind, str(name), set(self.names) - {path.stem})
@@ -117,7 +137,14 @@ class Shipped:
 def structure(
     data: Mapping[str, Any], cls: type[T], *, path: Path | None = None, text: str = ""
 ) -> T:
-    """Build the dataclass `cls` from a plain mapping under the rules of `load_toml`."""
+    """Create an instance of the dataclass `cls` from a mapping, with the checks of `load_toml`.
+
+    Args:
+        path, text: The file that the data come from, and its text, for error messages.
+
+    Raises:
+        ConfigError: As in `load_toml`.
+    """
     try:
         return _CONVERTER.structure(data, cls)
     except cattrs.BaseValidationError as group:
@@ -133,9 +160,10 @@ def structure(
 
 
 def structure_record(data: Mapping[str, Any], cls: type[T]) -> T:
-    """Build the dataclass `cls` from a section of a record.
+    """Create an instance of the dataclass `cls` from a section of a record.
 
-    Keys of other versions are ignored, and missing ones get their defaults.
+    Unknown keys, which other versions of mavfi wrote, are ignored. Missing fields get their
+    defaults.
 
     Raises:
         ValueError: A value has the wrong type, or a field without a default is missing.
@@ -167,7 +195,12 @@ _IN_WORDS = {int: "a whole number", float: "a number", bool: "true or false", st
 
 def _strict(kind: type, *accepted: type) -> Any:
     def hook(value: Any, _cls: Any) -> Any:
-        """Convert a value. Raises TypeError for a wrong type, ValueError if it is not finite."""
+        """Check the type of a value and convert it to `kind`.
+
+        Raises:
+            TypeError: The value has the wrong type.
+            ValueError: The value is infinite or NaN.
+        """
         if isinstance(value, bool) is not (kind is bool) or not isinstance(
             value, (kind, *accepted)
         ):
@@ -181,7 +214,11 @@ def _strict(kind: type, *accepted: type) -> Any:
 
 def _shaped(accepted: Any, wanted: str, structured: Any, length: int | None = None) -> Any:
     def hook(value: Any, cls: Any) -> Any:
-        """Convert a table or array. Raises TypeError for a wrong type, also a string, or length."""
+        """Check the type and length of a table or array, and convert its items.
+
+        Raises:
+            TypeError: The type or the length is wrong. A string is not an array.
+        """
         if not isinstance(value, accepted):
             raise TypeError(f"must be {wanted}, got {value!r}")
         if length is not None and len(value) != length:
@@ -191,7 +228,7 @@ def _shaped(accepted: Any, wanted: str, structured: Any, length: int | None = No
     return hook
 
 
-_origin: Any = get_origin  # otherwise mypy takes classes for ParamSpec
+_origin: Any = get_origin  # otherwise mypy takes its argument for a ParamSpec
 
 
 def _converter(*, forbids_others: bool) -> cattrs.Converter:
@@ -228,7 +265,11 @@ configure_union_passthrough(float | int | bool | None, _RECORDS)
 
 
 def _first_problem(error: Exception, key: str) -> tuple[str, Exception]:
-    """Return the key and the innermost error of the first failure in a cattrs error group."""
+    """Return the dotted key and the innermost exception of the first failure in a cattrs error.
+
+    Args:
+        key: Dotted key of the value that `error` is about.
+    """
     if not isinstance(error, ExceptionGroup):
         return key, error
     extra = [item for item in error.exceptions if isinstance(item, ForbiddenExtraKeysError)]
@@ -242,7 +283,10 @@ def _first_problem(error: Exception, key: str) -> tuple[str, Exception]:
 
 
 def _line_of(text: str, key: str) -> int | None:
-    """Return the number of the line that sets a dotted key, or else of its table's header."""
+    """Return the number of the line that sets a dotted key, or else of its table's header, or None.
+
+    None means that the text has neither.
+    """
     section, _, last = key.rpartition(".")
     last = last.partition("[")[0]
     current, head = "", None
@@ -260,7 +304,12 @@ def _line_of(text: str, key: str) -> int | None:
 
 
 def _table_of(head: str, counts: dict[str, int]) -> str:
-    """Return the name of the table that a header opens, with its index in an array of tables."""
+    """Return the dotted name of the table that a header opens, with indices in arrays of tables.
+
+    Args:
+        head: The header, such as `[[setting]]`.
+        counts: Index of the newest table in each array of tables; updated by this call.
+    """
     parts = head.strip("[ ").split("]")[0].split(".")
     names = [".".join(parts[: end + 1]).strip() for end in range(len(parts))]
     if head.startswith("[["):

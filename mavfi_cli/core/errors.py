@@ -12,23 +12,36 @@ E = TypeVar("E", bound=Enum)
 
 
 class MavfiError(Exception):
-    """A known error. The command line prints it in one line and exits with `exit_code`."""
+    """Base class of all errors that mavfi raises for users.
+
+    The command line prints the message in one line and exits with `exit_code`.
+    """
 
     exit_code = 1
 
 
 def described(error: BaseException) -> str:
-    """Return an error's type and message. A lone surrogate, which UTF-8 lacks, is escaped."""
+    """Return the type and the message of an error as `TYPE: MESSAGE`.
+
+    Lone surrogates, which UTF-8 cannot encode, are escaped.
+    """
     return f"{type(error).__name__}: {error}".encode(errors="backslashreplace").decode()
 
 
 def printable(text: str) -> str:
-    """Return a line in which every character that could control a terminal is replaced."""
+    """Return a copy of `text` in which every character that could control a terminal is replaced.
+
+    Newlines are replaced, too.
+    """
     return "".join(c if c.isprintable() else "\ufffd" for c in text)
 
 
 def lack_of(error: Exception) -> str:
-    """Describe what is wrong with a file's contents, from the error that using them raised."""
+    """Return a phrase for what is wrong with a file.
+
+    Args:
+        error: The exception that was raised when the contents of the file were used.
+    """
     match error:
         case KeyError():
             return f"it has no {error}"
@@ -41,7 +54,10 @@ def lack_of(error: Exception) -> str:
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
-    """Return the known name most similar to `name`, ignoring case and folder, or None."""
+    """Return the known name that is most similar to `name`, or None if none is similar enough.
+
+    Case and the folder in a known name are ignored.
+    """
     for candidate in known:
         if candidate.endswith(f"/{name}"):
             return candidate
@@ -61,7 +77,15 @@ def _suggestion(name: str, known: Iterable[str]) -> str:
 
 
 class UnknownName(MavfiError):
-    """An unknown name, which is a usage error. The message suggests the nearest known name."""
+    """The user gave a name that does not exist. The message suggests the nearest known name.
+
+    It is a usage error.
+
+    Args:
+        kind: What the name should be the name of, such as `world`.
+        name: The unknown name.
+        known: All known names.
+    """
 
     exit_code = 2
 
@@ -70,7 +94,10 @@ class UnknownName(MavfiError):
 
 
 def named_member(kind: type[E], what: str, name: str | E) -> E:
-    """Return the enumeration member with this value.
+    """Return the member of the enumeration `kind` whose value is `name`.
+
+    Args:
+        what: What `name` names, for the error message.
 
     Raises:
         UnknownName: No member has this value. The message suggests the nearest.
@@ -82,7 +109,10 @@ def named_member(kind: type[E], what: str, name: str | E) -> E:
 
 
 class ConfigError(MavfiError):
-    """A file or value that cannot be used. The message gives file, line, key and problem."""
+    """A setting or a file of settings cannot be used.
+
+    The message gives the file, the line, the key and the problem, as far as they are known.
+    """
 
     def __init__(
         self, problem: str, *, path: Path | None = None, line: int | None = None, key: str = ""
@@ -98,7 +128,7 @@ class ConfigError(MavfiError):
     def unknown_key(
         cls, key: str, known: Iterable[str], *, path: Path | None = None, line: int | None = None
     ) -> Self:
-        """Return the error for an unknown key. Its message suggests the nearest known key."""
+        """Create the error for a key that does not exist. It suggests the nearest known key."""
         problem = f"unknown key; {_suggestion(key.rpartition('.')[2], known)}"
         return cls(problem, path=path, line=line, key=key)
 
@@ -108,7 +138,7 @@ class WorldError(MavfiError):
 
 
 class PlaceError(WorldError):
-    """The start or goal is blocked or outside the world, which is a usage error."""
+    """The start or the goal of a mission is blocked or outside the world. It is a usage error."""
 
     exit_code = 2
 
@@ -118,7 +148,7 @@ class LinkError(MavfiError):
 
 
 class NoAutopilot(LinkError):
-    """No autopilot heartbeat arrived."""
+    """No heartbeat of an autopilot arrived in time."""
 
 
 class CommandRefused(LinkError):
@@ -126,15 +156,19 @@ class CommandRefused(LinkError):
 
 
 class LinkLost(LinkError):
-    """The peer stopped sending or closed the connection."""
+    """The other end of a MAVLink connection stopped sending, or closed the connection."""
 
 
 class CannotLift(MavfiError):
-    """A vehicle whose rotors cannot lift its payload."""
+    """The rotors of a vehicle cannot lift its payload."""
 
 
 class VehicleProcessError(MavfiError):
-    """The simulated vehicle could not start or ended early; keeps its exit code."""
+    """The process of the simulated vehicle could not start, or ended early.
+
+    Attributes:
+        exit_code: Exit code of that process, or 1. The command line exits with it, too.
+    """
 
     def __init__(self, problem: str, exit_code: int = 1) -> None:
         super().__init__(problem)
@@ -142,44 +176,60 @@ class VehicleProcessError(MavfiError):
 
 
 class ModelError(MavfiError):
-    """A detector model, or its training data, that cannot be used or created."""
+    """A detector model, or the data to train it, cannot be used or created."""
 
     def __init__(self, problem: str, *, path: Path | None = None) -> None:
         super().__init__(problem if path is None else f"{path}: {problem}")
 
 
 class RecordError(MavfiError):
-    """A file or folder of results that cannot be written or read."""
+    """A file or folder of results cannot be written or read."""
 
 
 class FaultError(MavfiError):
-    """A fault that cannot be described, injected or repeated."""
+    """A fault is badly described, or it cannot be injected or repeated."""
 
 
 class FaultSpecError(FaultError):
-    """An inconsistent fault description."""
+    """The description of a fault is invalid or contradicts itself."""
 
 
 class TracingForbidden(FaultError):
-    """The operating system does not permit tracing. The message explains how to allow it."""
+    """The operating system does not allow mavfi to trace a process.
+
+    The message explains how to allow it.
+
+    Args:
+        what: What needs tracing, such as `instruction-level injection`.
+        problem: What the operating system refused.
+        remedy: How to allow it.
+    """
 
     def __init__(self, what: str, problem: str, remedy: str) -> None:
         super().__init__(f"{what} is not possible here ({problem}): {remedy}")
 
 
 class TargetError(FaultError):
-    """A target program that cannot be started or that ends before the trigger."""
+    """The target of a fault cannot be started or used, or ended before the fault was triggered.
+
+    Args:
+        program: Name of the target: a program, a process, a node or a flight.
+        problem: What went wrong.
+    """
 
     def __init__(self, program: str, problem: str) -> None:
         super().__init__(f"{program}: {problem}")
 
 
 class BuildMismatch(FaultError):
-    """A fault record from another build. The message names every object that differs."""
+    """A recorded fault cannot be repeated, because it was recorded with other machine code.
+
+    The message names every executable and library that differs.
+    """
 
     def __init__(self, differences: Iterable[str]) -> None:
         super().__init__(f"the record comes from another build: {'; '.join(differences)}")
 
 
 class Interrupted(MavfiError):
-    """The user requested a stop."""
+    """The user asked to stop, for example with Ctrl-C."""

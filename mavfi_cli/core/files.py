@@ -1,8 +1,8 @@
 """Handles files: atomic writes, bounded reads and scratch folders.
 
 A process that is killed while it writes leaves the old file or the new one, never a partial one. A
-folder of results is untrusted: nothing is written through a link in it, and every read from it is
-bounded.
+folder of results is untrusted: nothing is written through a link in it, and every read from it has
+a limit of size.
 """
 
 from __future__ import annotations
@@ -32,7 +32,10 @@ _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 def file_digest(name: str | Path) -> str:
-    """Return the SHA-256 of a regular file's bytes; empty if there is no such file."""
+    """Return the SHA-256 of a file's contents in hexadecimal, or "" if it cannot be read.
+
+    Only regular files are read.
+    """
     try:
         with open(os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
             if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -44,7 +47,7 @@ def file_digest(name: str | Path) -> str:
 
 @contextlib.contextmanager
 def writing(place: Path) -> Iterator[None]:
-    """Convert an OSError in the block into a RecordError that names the path."""
+    """Return a context manager that converts an OSError into a RecordError naming `place`."""
     try:
         yield
     except OSError as error:
@@ -54,7 +57,10 @@ def writing(place: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def reading(place: Path) -> Iterator[None]:
-    """Convert errors caused by a file's damaged contents into RecordError."""
+    """Return a context manager that converts errors about a file's contents into RecordError.
+
+    These are the exceptions that using damaged contents raises. The message names `place`.
+    """
     try:
         yield
     except (
@@ -64,13 +70,13 @@ def reading(place: Path) -> Iterator[None]:
 
 
 def read_bounded(path: Path, limit: int) -> bytes:
-    """Read a regular file without following links or waiting for pipes.
+    """Return the contents of a regular file, without following links or waiting for pipes.
 
     Args:
-        limit: largest allowed size in bytes.
+        limit: largest allowed size of the file in bytes.
 
     Raises:
-        RecordError: It cannot be read, is not a regular file, or is larger.
+        RecordError: The file cannot be read, is not a regular file, or is larger than `limit`.
     """
     with writing(path), open(os.open(path, _READ), "rb") as file:
         about = os.fstat(file.fileno())
@@ -82,7 +88,12 @@ def read_bounded(path: Path, limit: int) -> bytes:
 
 
 def read_json(path: Path, limit: int) -> Json:
-    """Read a JSON object. Raises RecordError as `read_bounded` does, or if it is damaged."""
+    """Read a JSON object from a file.
+
+    Raises:
+        RecordError: The file cannot be read, is not a regular file, is larger than `limit` bytes,
+            or does not contain a JSON object.
+    """
     with reading(path):
         value = json.loads(read_bounded(path, limit))
     if not isinstance(value, dict):
@@ -91,7 +102,11 @@ def read_json(path: Path, limit: int) -> Json:
 
 
 def open_own(path: Path, flags: int) -> int:
-    """Open or create a file that mavfi owns; return its descriptor. A link raises OSError."""
+    """Open a file that mavfi owns, or create it, and return its descriptor.
+
+    Raises:
+        OSError: The file cannot be opened, or it is a link.
+    """
     return os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
@@ -99,8 +114,8 @@ def own_folder(path: Path) -> Path:
     """Create a folder that mavfi owns, unless it exists, and return its path.
 
     Raises:
-        RecordError: It cannot be made, or something else has its name. A link to a folder is
-            refused too, because mavfi removes files in its folders.
+        RecordError: The folder cannot be created, or something that is not a folder has its name. A
+            link to a folder is refused too, because mavfi deletes files in its folders.
     """
     with writing(path):
         path.mkdir(parents=True, exist_ok=True)
@@ -110,7 +125,7 @@ def own_folder(path: Path) -> Path:
 
 
 def inflate(data: bytes, limit: int) -> bytes:
-    """Decompress zlib's format.
+    """Decompress data in zlib's format and return the result.
 
     Raises:
         ValueError: The data are damaged or truncated, or decompress to more than `limit` bytes.
@@ -130,7 +145,7 @@ _unsynced: set[Path] = set()
 
 
 def leave_unsynced(folder: Path) -> None:
-    """Let this process and its forks write files below a folder without syncing them.
+    """Let `write_atomically` skip syncing files below a folder, in this process and its forks.
 
     Use it for a folder that need not survive a power failure, because its files are temporary or
     are synced later by `sync_folder`. Each sync takes 10 to 300 ms, during which nothing else runs.
@@ -139,10 +154,10 @@ def leave_unsynced(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync the regular files and the folders below a folder, and the folder itself.
+    """Sync a folder and all regular files and folders below it to disk.
 
     Raises:
-        RecordError: One of them cannot be synced.
+        RecordError: A file or folder cannot be synced.
     """
     for parent, _, names in os.walk(folder):
         paths = [Path(parent, name) for name in names]
@@ -162,6 +177,9 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
     Several processes may write the same file. Each uses a temporary file of its own, and the last
     rename wins.
+
+    Args:
+        write: Writes the contents to the open file that it gets.
 
     Raises:
         RecordError: The file could not be written (disk full, no permission). The old file stays.
@@ -190,24 +208,24 @@ _TRIES = 10  # attempts to remove a folder, in which a dying program may still c
 class ScratchFolder:
     """A private temporary folder that is removed however the process ends.
 
-    It is removed by `close`, when the object is deleted, or when the process exits. A killed
-    process leaves it behind, and the next process that makes a scratch folder in the same place
-    removes it. A lock on a file in the folder shows that the process, or a fork of it, is still
-    running. A fork never removes the folder of its parent.
+    The folder is removed by `close`, when the object is deleted, or when the process exits. A
+    killed process leaves it behind, and the next process that makes a scratch folder in the same
+    place removes it. A lock on a file in the folder shows that the process, or a fork of it, is
+    still running. A fork never removes the folder of its parent.
 
-    As a context manager it returns the path.
+    As a context manager, the object returns the path.
 
     Args:
-        what: A word in its name, `mavfi-WHAT-...`.
-        parent: Folder to create it in; its name then begins with a dot. None selects the temporary
-            directory.
+        what: A word in the name of the folder, `mavfi-WHAT-...`.
+        parent: Where to create the folder; its name then begins with a dot. None selects the
+            temporary directory.
 
     Attributes:
-        path: The folder.
-        close: Removes the folder. May be called repeatedly.
+        path: Path of the folder.
+        close: Removes the folder. Safe to call more than once.
 
     Raises:
-        RecordError: It cannot be made.
+        RecordError: The folder cannot be created.
     """
 
     def __init__(self, what: str, parent: Path | None = None) -> None:
@@ -225,7 +243,7 @@ class ScratchFolder:
 
 
 def _locked_folder(place: Path, prefix: str) -> tuple[Path, int]:
-    """Make a scratch folder; return it and the descriptor of the locked file in it."""
+    """Create a scratch folder. Return its path, and the descriptor of the locked file in it."""
     while True:
         path = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
         lock = os.open(path / _OWNED, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
@@ -246,7 +264,10 @@ def _remove_scratch(path: Path, lock: int, owner: int) -> None:
 
 @cache
 def _remove_abandoned(place: Path) -> None:
-    """Remove the scratch folders that killed processes of this user left; once per process."""
+    """Remove the scratch folders in `place` that killed processes of this user left behind.
+
+    Only the first call with a path does so; later calls in the same process return at once.
+    """
     for path in [*place.glob(f"{_SCRATCH}*"), *place.glob(f".{_SCRATCH}*")]:
         with contextlib.suppress(OSError):  # not ours, or its process is running
             about = path.lstat()
@@ -261,11 +282,14 @@ def _remove_abandoned(place: Path) -> None:
 
 
 def require_output(path: Path, suffixes: Sequence[str] = ()) -> None:
-    """Check that a file can be written, before its contents are computed.
+    """Raise an error if a file cannot be written. Call it before computing the contents.
+
+    Args:
+        suffixes: allowed suffixes of the name; empty allows all.
 
     Raises:
         RecordError: The name has none of the given suffixes, the folder does not exist or cannot be
-            written, or the path is not a regular file.
+            written, or the path exists and is not a regular file.
     """
     if suffixes and path.suffix.lower() not in suffixes:
         *others, last = suffixes
@@ -279,10 +303,11 @@ def require_output(path: Path, suffixes: Sequence[str] = ()) -> None:
 
 
 def require_folder(folder: Path) -> None:
-    """Check that a folder can be created and written, before its contents are computed.
+    """Raise an error if a folder cannot be created or written. Call it before computing contents.
 
     Raises:
-        RecordError: Its name is not UTF-8, as tables require, or it cannot be created or written.
+        RecordError: The name of the folder is not UTF-8, as tables require, or the folder cannot be
+            created or written.
     """
     try:
         str(folder).encode()
@@ -293,12 +318,18 @@ def require_folder(folder: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a UTF-8 text file atomically. A lone surrogate, which UTF-8 lacks, is escaped."""
+    """Write a text file atomically, in UTF-8.
+
+    Lone surrogates, which UTF-8 cannot encode, are escaped.
+    """
     write_atomically(path, lambda file: file.write(text.encode(errors="backslashreplace")))
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON atomically with sorted keys. A number that is not finite becomes null."""
+    """Write a value to a JSON file atomically, with sorted keys.
+
+    `plain` converts the value, so NaN and infinities become null.
+    """
     write_text(path, json.dumps(plain(value), indent=2, sort_keys=True, allow_nan=False) + "\n")
 
 
@@ -310,10 +341,13 @@ def write_parquet(path: Path, table: Any) -> None:
 
 
 def read_parquet(path: Path, what: str) -> Any:
-    """Read an Arrow table.
+    """Read an Arrow table from a Parquet file.
+
+    Args:
+        what: what the file contains, for the error message.
 
     Raises:
-        RecordError: The file is missing or damaged. The message calls it `what`.
+        RecordError: The file is missing, damaged or too large.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -331,9 +365,9 @@ def read_parquet(path: Path, what: str) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Return a JSON-ready copy.
+    """Return a copy of a value that can be stored as JSON.
 
-    numpy scalars and arrays become numbers and lists. Numbers that are not finite become null.
+    numpy scalars and arrays become numbers and lists. NaN and infinities become None.
     """
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}

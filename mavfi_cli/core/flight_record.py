@@ -1,4 +1,4 @@
-"""Defines the sections of a result.json, which a flight writes and all other parts read.
+"""Defines the sections of result.json, the record that a flight writes and other parts read.
 
 A record of a mission that was cut off, or from an earlier version, lacks some of the fields, so
 every field has a default. docs/reference/records.md describes all of them.
@@ -18,7 +18,7 @@ Point = tuple[float, float, float]  # ENU, m
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QualityOfFlight:
-    """The quality of flight (QoF); unknown values are None."""
+    """The quality of flight (QoF) of a mission. Unknown values are None."""
 
     flight_time_s: float | None = None
     distance_m: float | None = None
@@ -32,25 +32,30 @@ class QualityOfFlight:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Event:
-    """One event of a flight."""
+    """One event of a flight, such as a new phase, a new plan or an alarm."""
 
     stamp_s: float = 0.0
-    kind: str = ""  # phase, autopilot, plan, collision, outcome
+    kind: str = ""  # such as phase, autopilot, plan, collision, outcome
     text: str = ""
     position_enu_m: Point | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedPlan:
-    """The waypoints of a plan."""
+    """The waypoints of a plan, and the time at which it was recorded."""
 
     stamp_s: float = 0.0
-    points_enu_m: Any = ()  # (n, 3) lists; None stands for infinity or NaN
+    points_enu_m: Any = ()  # nested lists of shape (n, 3); None stands for infinity or NaN
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResponseTime:
-    """Times from a depth frame to its setpoint, s; None if there was none."""
+    """Statistics of the times from a depth frame to the first setpoint that depends on it.
+
+    Attributes:
+        median, p95: Median and 95th percentile in seconds; None if no setpoint depended on a frame.
+        count: Number of times.
+    """
 
     median: float | None = None
     p95: float | None = None
@@ -62,7 +67,13 @@ class ResponseTime:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelUse:
-    """A kernel's invocations, its inputs that newer ones replaced, and the time it was busy."""
+    """How often a kernel ran, and how long.
+
+    Attributes:
+        invocations: Number of invocations.
+        dropped_inputs: Number of inputs that newer inputs replaced before the kernel read them.
+        busy_s: Total time of all invocations.
+    """
 
     invocations: int = 0
     dropped_inputs: int = 0
@@ -71,7 +82,7 @@ class KernelUse:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeCrash:
-    """The death of a node's process."""
+    """The death of a node's process: when it died, and how."""
 
     stamp_s: float = 0.0
     how: str = ""
@@ -79,7 +90,7 @@ class NodeCrash:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeEnds:
-    """Crashes, hangs and restarts of a node."""
+    """The crashes of a node, and the number of its hangs and restarts."""
 
     crashes: Sequence[NodeCrash] = ()
     hangs: int = 0
@@ -96,7 +107,7 @@ class ProgramEnds:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredKernel:
-    """Medians of a kernel's times on this host and in the flight, s."""
+    """The measured times of a kernel: median on the host, and median latency in the flight."""
 
     host_median_s: float = 0.0
     latency_median_s: float = 0.0
@@ -117,12 +128,13 @@ class MeasuredPlatform:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Change:
-    """One value that a strike changed.
+    """One value that a fault changed when it struck.
 
     Attributes:
         index: Index of the waypoint; 0 for messages without waypoints.
-        before, after: None in a record stands for infinity or NaN, which JSON lacks; `before_hex`
-            and `after_hex` have the bits.
+        before, after: The value before and after the change. None in a record stands for infinity
+            or NaN, which JSON lacks.
+        before_hex, after_hex: The bits of these values in hexadecimal.
     """
 
     state: str = ""
@@ -136,7 +148,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Strike:
-    """One action of the fault on the mission."""
+    """One action of a fault: when it struck, and which values it changed."""
 
     stamp_s: float = 0.0
     tick: int = 0
@@ -147,7 +159,7 @@ class Strike:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reader:
-    """The first receiver that used a corrupted value, and when."""
+    """The first receiver that read a corrupted value, and the time at which it did."""
 
     name: str = ""
     stamp_s: float = 0.0
@@ -156,7 +168,14 @@ class Reader:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedTrigger:
-    """The trigger of a fault, and the time that was drawn for it, s after the take-over."""
+    """The trigger of a fault, and the time that was drawn for it, if any.
+
+    Attributes:
+        when: Kind of the trigger, such as `time` or `tick`.
+        number: Number that belongs to the kind, such as that of the tick.
+        drawn_time_s: The time that was drawn at random, in seconds after the companion took
+            control; None if no time was drawn.
+    """
 
     when: str = ""
     number: float = 0.0
@@ -166,7 +185,7 @@ class RecordedTrigger:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedActivation:
-    """Whether a corrupted value was read, and its first reader."""
+    """What happened to a corrupted value, and the first receiver that read it, if any did."""
 
     activation: str = ""
     first_reader: Reader | None = None
@@ -174,12 +193,12 @@ class RecordedActivation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StateFault:
-    """The record of a fault in a state or in the detector, or of a killed process.
+    """The record of a source-level fault: in a state, in the detector, or a killed process.
 
     Attributes:
-        reason: Why it was not injected.
-        request: The user's request, as a `FaultConfig`.
-        states, units: Names of what the fault strikes, and their units.
+        reason: Why the fault was not injected; empty if it was.
+        request: The fault that the user asked for, as the fields of a `FaultConfig`.
+        states, units: Names of the values that the fault strikes, and their units.
         strikes: The first strikes; `strike_count` counts all.
     """
 
@@ -199,11 +218,13 @@ class StateFault:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedAlarm:
-    """An alarm of a detector.
+    """An alarm of a detector in a flight.
 
     Attributes:
-        message: Kind of the message that raised it: report, plan, ahead (active plan) or tick.
-        recomputes: Recomputed stage if it differs from `stage`; else None, which is not written.
+        message: Kind of the message that raised the alarm: report, plan, ahead (active plan) or
+            tick.
+        recomputes: The recomputed stage if it differs from `stage`, otherwise None. None is not
+            written to the record.
     """
 
     stamp_s: float = 0.0
@@ -217,7 +238,7 @@ class RecordedAlarm:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedRecovery:
-    """Number and total time of the phases in which a stage had no accepted message."""
+    """The number and total time of the periods in which the gate accepted no message of a stage."""
 
     count: int = 0
     total_s: float = 0.0
@@ -225,13 +246,14 @@ class RecordedRecovery:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detection:
-    """What a detector did in one flight.
+    """What a detector did in one flight: its checks, alarms, responses and recoveries.
 
     Attributes:
-        checks: Number by kind of message.
-        responses: Number by response.
+        protect: Stages that the detector watched.
+        checks: Number of checks by kind of message.
+        responses: Number of alarms by the response to them.
         alarms: The first alarms, oldest first; `alarm_count` counts all.
-        recoveries: By stage.
+        recoveries: Recoveries by stage.
     """
 
     detector: str = ""
@@ -249,7 +271,7 @@ class Detection:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedCorruption:
-    """The flipped bits of a register, of an instruction or of memory."""
+    """The bits that a fault flips, and the register, instruction or memory that contains them."""
 
     site: str = ""
     role: str = ""
@@ -259,7 +281,10 @@ class RecordedCorruption:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Flip:
-    """Whether the bits were flipped, and the value before and after as hexadecimal text."""
+    """The result of a bit flip: whether it was applied, and the value before and after it.
+
+    The values are hexadecimal strings.
+    """
 
     applied: bool = False
     before: str = ""
@@ -268,7 +293,7 @@ class _Flip:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadingInstruction:
-    """Whether the corrupted value was read, and the instruction that read it."""
+    """What happened to a corrupted operand, and the instruction that read it, if any did."""
 
     activation: str = ""
     instruction: str = ""
@@ -276,16 +301,16 @@ class ReadingInstruction:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MissionInstructionFault:
-    """The record of a fault in an instruction of a node.
+    """The record of an instruction-level fault in a node.
 
     Attributes:
         state: planned, applied, not_injected or null (nothing was to be flipped).
-        reason: Why it was not injected.
-        request: The user's request, as an `InstructionConfig`.
-        stamp_s: Simulated time of the struck invocation, s.
+        reason: Why the fault was not injected; empty if it was.
+        request: The fault that the user asked for, as the fields of an `InstructionConfig`.
+        stamp_s: Simulated time of the struck invocation, in seconds.
         k: Number of the struck execution of the instruction.
-        corruption: None without a flip.
-        injection: None if the process was cut off before the result was known.
+        corruption: The bits to flip; None if nothing was to be flipped.
+        injection: Result of the flip; None if the process was cut off before it was known.
     """
 
     state: str = ""

@@ -76,13 +76,16 @@ _LONGEST_WAIT_S = 3600.0
 
 class _Module(Protocol):
     def prepare(self) -> None:
-        """Load everything once, without starting a thread."""
+        """Load everything that tasks need, without starting a thread.
+
+        The server calls it once, before it forks.
+        """
 
     def perform(self, task: Mapping[str, Any], folder: Path) -> Path:
-        """Perform a task. Return the folder for its results, which it has created in `folder`.
+        """Perform a task in a worker. Return the folder with the results, created in `folder`.
 
-        If the request allows the worker to fork itself, there is another argument, `forks`, a
-        `Forks`. In a fork, the folder is created in the fork's own folder.
+        If the request allows the worker to fork itself, there is a further argument, `forks`, which
+        is a `Forks`. In a fork of the worker, the folder is created in the fork's own folder.
         """
 
 
@@ -90,7 +93,13 @@ class _Module(Protocol):
 
 
 class ForkServer:
-    """Starts workers that call a module's `perform`. Restarts the server if it was killed."""
+    """Client of a fork server, which starts worker processes that call `perform` of a module.
+
+    The server is started with the first worker, and restarted if it was killed.
+
+    Args:
+        module: Name of the module.
+    """
 
     def __init__(self, module: str) -> None:
         self._module = module
@@ -100,14 +109,17 @@ class ForkServer:
     def start(
         self, task: Mapping[str, Any], folder: Path, limit_s: float, *, forks: bool = False
     ) -> socket.socket:
-        """Start a worker for a task. Return the channel on which its guard reports.
+        """Start a worker for a task. Return the socket on which its guard reports how it ended.
+
+        The module's docstring describes the messages. Closing the socket ends the worker.
 
         Args:
             folder: receives the worker's results, standard error and temporary files.
-            forks: the worker may fork itself, and reports the ends of its forks too.
+            limit_s: limit of the worker's wall time, in seconds, after which it is killed.
+            forks: whether the worker may fork itself. It then reports the ends of its forks too.
 
         Raises:
-            MavfiError: the server cannot be started, or the folder cannot be made.
+            MavfiError: the server cannot be started, or the folder cannot be created.
         """
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -124,7 +136,10 @@ class ForkServer:
                     continue
                 undo.pop_all()
                 return ours
-        raise MavfiError("the process that forks the workers ended twice before it got the task")
+        raise MavfiError(
+            "cannot start a worker: the process that forks the workers ended twice before it "
+            "received the task"
+        )
 
     def _running(self) -> socket.socket:
         if self._control is not None:
@@ -151,7 +166,10 @@ class ForkServer:
         return ours
 
     def close(self) -> None:
-        """End the server. Guards and workers end when their channels are closed."""
+        """End the server process. Safe to call more than once.
+
+        Guards and workers go on until the sockets that `start` returned are closed.
+        """
         if self._control is None or self._process is None:
             return
         self._control.close()
@@ -167,7 +185,10 @@ class ForkServer:
 
 
 def _serve() -> NoReturn:
-    """Load the module, then fork a guard for every request until the client closes its end."""
+    """Run the server: load the module, then fork a guard for each request of the client.
+
+    The server ends when the client closes its end of the socket.
+    """
     _call_this_process(SERVER)
     control = socket.socket(fileno=int(sys.argv[1]))
     gc.disable()  # imports leave few cycles, and collections took an eighth of the time
@@ -192,7 +213,13 @@ def _serve() -> NoReturn:
 
 
 def _guard(control: socket.socket, packet: bytes, descriptor: int, module: _Module) -> int:
-    """Run a guard: fork the worker, wait for it, report its end."""
+    """Run a guard process: fork a worker, wait for it, and report how it ended.
+
+    Args:
+        control: the server's socket to the client, which the guard closes.
+        packet: the client's request as JSON.
+        descriptor: descriptor of the channel on which to report.
+    """
     control.close()
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     order, channel = json.loads(packet), socket.socket(fileno=descriptor)
@@ -202,7 +229,7 @@ def _guard(control: socket.socket, packet: bytes, descriptor: int, module: _Modu
     reading, writing = os.pipe()
 
     def work() -> NoReturn:
-        """Close the guard's ends of the channels and do the work."""
+        """Run the worker: close the ends of the channels that only the guard needs, and work."""
         os.close(reading)
         forks = None
         if order["forks"]:
@@ -229,11 +256,14 @@ def _end_of(
     deadline_s: float,
     others: Sequence[int] = (),
 ) -> Json:
-    """Wait for a worker to end, and kill its descendants. Return how it ended, and its report.
+    """Wait until a worker has ended, and kill its descendants. Return how it ended, and its report.
+
+    The result has the keys of the guard's last message, without `wall_s`.
 
     Args:
-        reading: read end of the pipe that carries its report.
-        others: children of this process that do not belong to the worker.
+        reading: read end of the pipe that carries the worker's report.
+        deadline_s: time on the monotonic clock at which the worker is killed.
+        others: children of this process that do not belong to the worker, and are not killed.
 
     Raises:
         ConnectionError: the client closed the channel.
@@ -252,7 +282,7 @@ def _end_of(
 
 
 def _await(worker: int, channel: socket.socket, deadline_s: float) -> bool:
-    """Wait until the worker has ended. Return True if it was killed because its time ran out.
+    """Wait until the worker has ended. Return True if it was killed at its deadline.
 
     Raises:
         ConnectionError: the client closed the channel.
@@ -293,7 +323,10 @@ def _report_of_worker(reading: int) -> Any:
 def _work(
     order: Mapping[str, Any], module: _Module, guard: int, writing: int, forks: Forks | None
 ) -> NoReturn:
-    """Perform the task, report its result and exit. A fork of the worker ends here, too."""
+    """Run the worker: perform the task, report the result or the error, and exit.
+
+    A fork of the worker ends here, too.
+    """
     code, report = 1, {}
     try:
         _call_this_process(WORKER)
@@ -319,7 +352,12 @@ def _work(
 class Forks:
     """Lets a worker fork itself in the middle of its task, so that several tasks share a beginning.
 
-    The worker waits while its fork runs: only one process runs at a time, but both are in memory.
+    The worker waits while its fork runs, so only one process runs at a time, but both use memory.
+
+    Args:
+        folder: folder of the worker.
+        channel: channel to the client.
+        report: write end of the pipe that carries the worker's report.
     """
 
     def __init__(self, folder: Path, channel: socket.socket, report: int) -> None:
@@ -329,14 +367,15 @@ class Forks:
     def fork(self, key: int, folder: Path, limit_s: float) -> bool:
         """Fork the worker. Return True in the fork, and False in the worker after the fork's end.
 
-        The fork ends by returning from `perform`. No fork is made if HALT exists, or if the system
-        has no memory or process left. In the latter case a message tells the client.
+        The fork ends by returning from `perform`. The method returns False without a fork if the
+        file HALT exists in the worker's folder, or if the system has no memory or process left. In
+        the latter case the client gets a message with the reason.
 
         Args:
-            key: identifies the fork in the message about its end. The message also gives the wall
-                time since the end of the previous fork.
-            folder: as for `ForkServer.start`.
-            limit_s: limit of the fork's wall time, s.
+            key: identifies the fork in the message to the client about its end. The message also
+                gives the wall time since the end of the previous fork.
+            folder: receives the fork's results, standard error and temporary files.
+            limit_s: limit of the fork's wall time, in seconds, after which it is killed.
         """
         if self._halt.exists():
             return False
@@ -371,16 +410,17 @@ class Forks:
 
 
 def _begin(folder: Path, parent: int) -> None:
-    """Give this process its own session and streams, and let it die with its parent."""
+    """Give a new worker or fork its own session and streams, and have it die with its parent."""
     os.setsid()
     die_with(parent)
     _isolate_streams(folder)
 
 
 def _isolate_streams(folder: Path) -> None:
-    """Give the worker its own streams and its own folder for temporary files.
+    """Redirect standard error and temporary files of this process to `folder`.
 
-    It does not recreate `folder`, which a client that is exiting may have removed.
+    Standard input and output go to /dev/null. `folder` is not recreated if it is gone, because a
+    client that is exiting may have removed it.
     """
     scratch = folder / SCRATCH
     scratch.mkdir(exist_ok=True)
@@ -399,7 +439,11 @@ def _isolate_streams(folder: Path) -> None:
 
 
 def die_with(parent: int) -> None:
-    """Have the kernel kill this process when `parent` ends. Exit if it has already ended."""
+    """Have Linux kill this process when the parent process ends. Exit if it has already ended.
+
+    Args:
+        parent: process id of the parent.
+    """
     _request(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
@@ -417,9 +461,9 @@ def _request(option: int, value: int | ctypes.c_char_p) -> None:
 
 
 def _end_children(others: Sequence[int] = ()) -> None:
-    """Kill and reap every descendant of this process, except the children `others`.
+    """Kill and reap every descendant of this process, except its children in `others`.
 
-    This process inherits the children of a killed child, so the loop repeats until there are none.
+    This process inherits the children of a killed child, so the loop repeats until none are left.
     """
     while children := [pid for pid in _children() if pid not in others]:
         for pid in children:
@@ -431,9 +475,10 @@ def _end_children(others: Sequence[int] = ()) -> None:
 
 
 def _children() -> list[int]:
-    """Return the children of this process; none if Linux does not list them.
+    """Return the process ids of the children of this process.
 
-    The main thread is read last, as it inherits the children of a thread that ends meanwhile.
+    The list is empty if Linux does not list children. The main thread is read last, because it
+    inherits the children of a thread that ends meanwhile.
     """
     children = list[int]()
     threads = Path("/proc/self/task").iterdir()

@@ -26,9 +26,10 @@ def is_within(limit: float, values: Iterable[float]) -> bool:
 
 
 def dot(a: Vector | Sequence[float], b: Vector | Sequence[float]) -> float:
-    """Return the dot product of two vectors (n,), summed in the order of their elements.
+    """Return the dot product of two vectors of shape (n,), the same on every processor.
 
-    numpy's `@`, `dot` and `linalg.norm` use BLAS, and its last digit depends on the processor.
+    The products are summed in the order of the elements. numpy's `@`, `dot` and `linalg.norm` use
+    BLAS, whose last digit depends on the processor.
     """
     total = 0.0
     for x, y in zip(_floats(a), _floats(b), strict=True):
@@ -37,12 +38,12 @@ def dot(a: Vector | Sequence[float], b: Vector | Sequence[float]) -> float:
 
 
 def norm(vector: Vector | Sequence[float]) -> float:
-    """Return the Euclidean length of a vector (n,)."""
+    """Return the Euclidean length of a vector of shape (n,), the same on every processor."""
     return math.sqrt(dot(vector, vector))
 
 
 def rotate(rotation: Vector, vector: Vector | Sequence[float]) -> Vector:
-    """Return rotation @ vector, (3,), for a matrix (3, 3) and a vector (3,)."""
+    """Return the product `rotation` @ `vector` of a (3, 3) matrix and a (3,) vector, shape (3,)."""
     return np.array([dot(row, vector) for row in rotation])
 
 
@@ -51,7 +52,10 @@ def _floats(vector: Vector | Sequence[float]) -> Sequence[float]:
 
 
 def enu_from_ned(vector: Vector) -> Vector:
-    """Convert NED components (..., 3), in any unit, to ENU components (..., 3), or back."""
+    """Convert vectors from NED to ENU components, or from ENU to NED, which is the same operation.
+
+    Vectors may have any unit. The argument and the result have the shape (..., 3).
+    """
     if vector.shape == (3,):
         north, east, down = vector.tolist()
         return np.array((east, north, -down))
@@ -64,14 +68,17 @@ ned_from_enu = enu_from_ned
 
 
 def wrap_angle(angle_rad: float) -> float:
-    """Wrap an angle into [-pi, pi), rad. NaN and infinities give NaN."""
+    """Wrap an angle in radians into the range [-pi, pi). NaN and infinities give NaN."""
     if not math.isfinite(angle_rad):
         return math.nan
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def ned_yaw_from_enu(yaw_rad: float) -> float:
-    """Convert an ENU yaw, rad, to an NED heading in [-pi, pi), rad, or back."""
+    """Convert an ENU yaw to an NED heading, or back, which is the same operation.
+
+    The angle is in radians. The result is in the range [-pi, pi).
+    """
     return wrap_angle(math.pi / 2.0 - yaw_rad)
 
 
@@ -79,7 +86,10 @@ _HALF_SQRT2 = math.sqrt(0.5)
 
 
 def flu_enu_from_frd_ned(quaternion: Vector | Sequence[float]) -> Vector:
-    """Convert a body-FRD-to-NED quaternion (4,) to body-FLU-to-ENU, (4,), or back.
+    """Convert an attitude from FRD-to-NED to FLU-to-ENU, or back, which is the same operation.
+
+    The attitude is a quaternion of shape (4,) that rotates body into world.
+
 
     q_enu = q(ENU<-NED) * q_ned * q(FRD<-FLU), with q(ENU<-NED) = (0, s, s, 0), s = sqrt(1/2),
     and q(FRD<-FLU) = (0, 1, 0, 0). The result is a unit quaternion with w >= 0.
@@ -95,7 +105,10 @@ def flu_enu_from_frd_ned(quaternion: Vector | Sequence[float]) -> Vector:
 
 
 def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Vector:
-    """Return the quaternion (4,) of the z-y-x rotation by yaw, pitch, roll, rad."""
+    """Return the quaternion, shape (4,), of a rotation by yaw, pitch and roll, in radians.
+
+    The rotations are about the axes z, y and x, in this order.
+    """
     cr, sr = math.cos(roll_rad / 2.0), math.sin(roll_rad / 2.0)
     cp, sp = math.cos(pitch_rad / 2.0), math.sin(pitch_rad / 2.0)
     cy, sy = math.cos(yaw_rad / 2.0), math.sin(yaw_rad / 2.0)
@@ -110,13 +123,13 @@ def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> 
 
 
 def yaw_from_quaternion(quaternion: Vector | Sequence[float]) -> float:
-    """Return the yaw of a quaternion (4,), in [-pi, pi], rad."""
+    """Return the yaw of a quaternion of shape (4,), in radians in the range [-pi, pi]."""
     w, x, y, z = _floats(quaternion)
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def rotation_matrix(quaternion: Vector) -> NDArray[np.float64]:
-    """Return the rotation matrix (3, 3) of a unit quaternion (4,): world = R @ body."""
+    """Return the (3, 3) rotation matrix R of a unit quaternion of shape (4,): world = R @ body."""
     w, x, y, z = _floats(quaternion)
     return np.array(
         [

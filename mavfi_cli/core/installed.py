@@ -19,13 +19,21 @@ _LIBRARIES = ("numpy", "numba", "jsbsim", "pymavlink", "pyoctomap", "ompl", "pyt
 
 
 def installed_versions() -> dict[str, str]:
-    """Return the versions of mavfi, Python and all libraries that a record depends on."""
+    """Return the version of mavfi, of Python and of each library that can affect a record.
+
+    The versions are keyed by name.
+    """
     own = {"mavfi": __version__, "python": sys.version.split()[0]}
     return own | {name: importlib.metadata.version(name) for name in _LIBRARIES}
 
 
 def version_differences(recorded: Mapping[str, str], versions: Mapping[str, str]) -> list[str]:
-    """Describe each library that differs between a record and this installation."""
+    """Return one phrase for each program or library whose version differs from the recorded one.
+
+    Args:
+        recorded: Versions in a record, keyed by name.
+        versions: Versions of this installation, keyed by name.
+    """
     return [
         f"{name} was {recorded.get(name, 'absent')}, is {versions.get(name, 'absent')}"
         for name in sorted({*recorded, *versions})
@@ -34,12 +42,12 @@ def version_differences(recorded: Mapping[str, str], versions: Mapping[str, str]
 
 
 class PlugIns:
-    """The objects that mavfi and other packages register in an entry-point group.
+    """The plug-ins of one kind: objects that packages register in an entry-point group.
 
     Args:
         group: Name of the entry-point group.
-        kind: Noun for such an object in error messages.
-        ours: Names of mavfi's own objects, which need no entry point.
+        kind: Noun for a plug-in of this kind, for error messages.
+        ours: Names of mavfi's own objects of this kind, which need no entry point.
     """
 
     def __init__(self, group: str, kind: str, ours: Sequence[str] = ()) -> None:
@@ -47,20 +55,24 @@ class PlugIns:
 
     @cached_property
     def _entries(self) -> dict[str, EntryPoint]:
-        """The entry points by name. The first use reads the metadata of all packages."""
+        """The entry points of the group, keyed by name.
+
+        The first use reads the metadata of all installed packages.
+        """
         return {entry.name: entry for entry in reversed([*entry_points(group=self.group)])}
 
     @property
     def names(self) -> list[str]:
-        """Known names: mavfi's own, then the others in alphabetical order."""
+        """The names of mavfi's own objects, followed by those of plug-ins in alphabetical order."""
         return [*self._ours, *sorted(self._entries.keys() - set(self._ours))]
 
     def load(self, name: str) -> Any:
-        """Load the object of the entry point with this name.
+        """Import and return the object that is registered under a name.
 
         Raises:
-            UnknownName: No plug-in has this name. The message suggests the nearest.
-            MavfiError: Its module cannot be imported or lacks the object.
+            UnknownName: No entry point of the group has this name. The message suggests the nearest
+                name.
+            MavfiError: The module of the object cannot be imported, or lacks the object.
         """
         if name not in self._entries:
             raise UnknownName(self._kind, name, self.names)

@@ -1,4 +1,4 @@
-"""Option types: bounded numbers, and files and folders that a command writes."""
+"""Types of command-line options: bounded numbers, and files and folders that a command writes."""
 
 from __future__ import annotations
 
@@ -13,18 +13,23 @@ from mavfi_cli.core.files import require_folder, require_output
 
 
 class Number(click.FloatRange):
-    """A finite number within two bounds; click's own range accepts NaN."""
+    """The type of an option that takes a number within bounds.
+
+    Unlike click's own range, it rejects NaN.
+    """
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """Convert as click does, and reject NaN."""
+        """Convert the value as click does, and fail if it is NaN."""
         number = float(super().convert(value, param, ctx))
         return self.fail(f"{value} is not a number.", param, ctx) if number != number else number
 
 
 class _OutPath(click.Path):
-    """A path to write. An empty one is rejected, because it would mean the current folder.
+    """The type of an option that takes the path of a file or folder to write.
+
+    An empty path is rejected, because it would mean the current folder.
 
     Args:
         require: raises RecordError for a path that cannot be written.
@@ -47,14 +52,19 @@ class _OutPath(click.Path):
 
 
 class OutFolder(_OutPath):
-    """A folder for results, which is created if it does not exist."""
+    """The type of an option that takes a folder for results. The folder need not exist."""
 
     def __init__(self) -> None:
         super().__init__(require_folder, file_okay=False)
 
 
 class OutFile(_OutPath):
-    """A file to write, with one of the given suffixes."""
+    """The type of an option that takes a file to write.
+
+    Args:
+        suffixes: allowed suffixes of the file name; empty allows all.
+        allow_dash: whether `-` is accepted, which means stdout.
+    """
 
     def __init__(self, suffixes: Sequence[str] = (), *, allow_dash: bool = False) -> None:
         def require(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Fork processes, send values between them, and handle interrupts."""
+"""Forks processes, sends values between them, and handles interrupts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 PYTHON = (sys.executable, "-P")
-"""This interpreter, without imports from the working directory, which is the user's."""
+"""Command line of this Python interpreter. `-P` prevents imports from the working directory."""
 
 _LENGTH = 8
 _NEW_USER, _NEW_NETWORK = 0x1000_0000, 0x4000_0000  # unshare(2)
@@ -30,15 +30,14 @@ _libc = ctypes.CDLL(None)
 
 
 def fork(work: Callable[[], int] | None, *, exact: bool = False) -> int:
-    """Do work in a fork of this process. The fork exits with the returned code, or 1 on an error.
+    """Fork this process, and run `work` in the fork. Return the process id of the fork.
+
+    The fork exits with the code that `work` returns, or with 1 if `work` raises an exception.
 
     Args:
-        work: What the fork runs. With None, this call returns 0 in the fork.
+        work: What the fork runs. With None, this call returns in the fork, too, with 0.
         exact: Skip Python's hooks, which draw new random numbers, so that every fork has the same
             memory. The process must have one thread.
-
-    Returns:
-        Process id of the fork.
     """
     child = int(_libc.fork()) if exact else os.fork()
     if child or work is None:
@@ -51,21 +50,27 @@ def fork(work: Callable[[], int] | None, *, exact: bool = False) -> int:
 
 
 def send(connection: socket.socket, value: Any) -> None:
-    """Send one value."""
+    """Pickle a value and send it to the process at the other end, which calls `receive`."""
     data = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
     connection.sendall(len(data).to_bytes(_LENGTH, "little") + data)
 
 
 def value_of(message: bytes) -> Any:
-    """Return the value in bytes that `send` has sent. Raises as `receive` does."""
+    """Decode one message, given as the bytes that `send` writes, and return its value.
+
+    Raises:
+        pickle.UnpicklingError: The value has a type that messages do not contain.
+    """
     return _Values(io.BytesIO(message[_LENGTH:])).load()
 
 
 def receive(connection: socket.socket) -> Any:
-    """Receive one value. Bytes from a corrupted process cannot call any function.
+    """Receive one value that the process at the other end sent with `send`.
+
+    Decoding is safe: bytes from a corrupted process cannot call any function.
 
     Raises:
-        EOFError: The other end has closed.
+        EOFError: The other end has closed the connection.
         pickle.UnpicklingError: The value has a type that messages do not contain.
     """
     size = int.from_bytes(_exactly(connection, _LENGTH), "little")
@@ -81,7 +86,10 @@ _BUILT_IN = {
 
 
 class _Values(pickle.Unpickler):
-    """Unpickles only mavfi's dataclasses and enumerations, and numpy's values."""
+    """An unpickler that accepts only plain values, numpy's values and mavfi's own messages.
+
+    Messages consist of mavfi's dataclasses and enumerations.
+    """
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("numpy._core.numeric", "_frombuffer"):
@@ -96,19 +104,23 @@ class _Values(pickle.Unpickler):
 
 
 def _array(buffer: Any, dtype: Any, shape: Any, order: Any, *axes: Any) -> Any:
-    """Return an array with numpy's own object for a common dtype.
+    """Create an unpickled array, with numpy's own object as its dtype.
 
-    A pickle encodes which objects are identical. Sharing numpy's object makes the bytes of a
-    message independent of whether its arrays have been received.
+    A pickle encodes which objects are identical. With numpy's own dtype object, an array that has
+    been received is pickled to the same bytes as one that was created here.
     """
     make = sys.modules["numpy._core.numeric"]._frombuffer
     return make(buffer, sys.modules["numpy"].dtype(dtype.str), shape, order, *axes)
 
 
 def _exactly(connection: socket.socket, size: int) -> bytearray:
-    """Receive into one buffer with one call, so that a node's memory is the same in every run.
+    """Receive exactly `size` bytes into one buffer.
 
-    Only a signal, or a socket with a timeout, which no attacked node has, causes further calls.
+    One call does so, which makes the memory of a node the same in every run. Only a signal, or a
+    socket with a timeout, which no attacked node has, causes further calls.
+
+    Raises:
+        EOFError: The other end has closed the connection.
     """
     data = bytearray(size)
     view, filled = memoryview(data), 0
@@ -123,9 +135,10 @@ def _exactly(connection: socket.socket, size: int) -> bytearray:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[list[int]]:
-    """Turn Ctrl-C and SIGTERM into a request, so that a mission ends with a complete record.
+    """Collect Ctrl-C and SIGTERM in a list instead of ending, as a context manager.
 
-    Yields a list that is empty until a signal arrives. Has no effect outside the main thread.
+    The list is empty until a signal arrives. A mission checks it, so that it can end with a
+    complete record. Outside the main thread, signals are not collected.
     """
     received: list[int] = []
     previous: dict[signal.Signals, Any] = {}
@@ -140,15 +153,16 @@ def interruptible() -> Iterator[list[int]]:
 
 
 def leave_network() -> bool:
-    """Move this single-threaded process to a network of its own, which has only a loopback.
+    """Move this process to a network namespace of its own, which has only a loopback interface.
 
-    Its future children share it, so that they can use ports that are taken elsewhere.
+    Future children of the process share the namespace, so they can use ports that are taken
+    elsewhere. The process must have one thread.
 
     Returns:
-        False if the operating system does not allow it.
+        True on success, False if the operating system does not allow it.
 
     Raises:
-        OSError: The loopback cannot be used.
+        OSError: The loopback interface cannot be used.
     """
     user, group = os.getuid(), os.getgid()
     if _libc.unshare(_NEW_NETWORK) != 0:

@@ -1,4 +1,7 @@
-"""Prints the output of commands, in which no text can control the terminal; gives exit codes."""
+"""Prints the output of commands, and converts errors to messages and exit codes.
+
+Printed text cannot control the terminal.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +21,23 @@ from mavfi_cli.core.errors import Interrupted, MavfiError, described, nearest, p
 
 
 def cleaned(text: str) -> str:
-    """Return text in which all control characters except newlines are replaced."""
+    """Return a copy of `text` in which every control character except a newline is replaced."""
     return "\n".join(map(printable, text.split("\n")))
 
 
 def echo(text: str, *, nl: bool = True) -> None:
-    """Print text to stdout. Raises OSError if stdout cannot be written."""
+    """Print text to stdout, without characters that could control the terminal.
+
+    Raises:
+        OSError: Stdout cannot be written.
+    """
     click.echo(cleaned(text), nl=nl)
 
 
 def echo_lines(lines: Iterable[str]) -> None:
-    """Print lines to stdout. Newlines within a line are replaced, like other control characters.
+    """Print lines to stdout, without characters that could control the terminal.
+
+    A newline within a line is replaced, too.
 
     Raises:
         OSError: Stdout cannot be written.
@@ -37,14 +46,18 @@ def echo_lines(lines: Iterable[str]) -> None:
 
 
 def note(text: str) -> None:
-    """Print text to stderr."""
+    """Print text to stderr, without characters that could control the terminal."""
     click.echo(cleaned(text), err=True)
 
 
 def exit_code(program: Callable[[], object]) -> int:
-    """Call click's `main` in non-standalone mode. Return its exit code.
+    """Run `program` and return the exit code for this process.
 
     Known errors, usage errors (code 2) and failures to write output are each printed in one line.
+    Ctrl-C gives the code 130.
+
+    Args:
+        program: Calls click's `main` in non-standalone mode and returns its result.
     """
     gc.set_threshold(100_000)  # imports leave few cycles, so frequent collections waste time
     try:
@@ -65,7 +78,7 @@ def exit_code(program: Callable[[], object]) -> int:
         note_error(error)
         return error.exit_code
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else the rest of stdout fails at exit, too
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or flushing stdout at exit would fail again
         if not isinstance(error, BrokenPipeError):
             place = "" if error.filename is None else f"{error.filename}: "
             note_error(f"{place}{error.strerror or described(error)}")
@@ -74,7 +87,10 @@ def exit_code(program: Callable[[], object]) -> int:
 
 
 def leave(code: int) -> NoReturn:
-    """End this process like `sys.exit`, but do not spend a second on freeing objects."""
+    """End this process with an exit code, as `sys.exit` does, but without freeing all objects.
+
+    Freeing them takes about a second.
+    """
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
@@ -92,5 +108,5 @@ def _no_such_option(error: click.NoSuchOption) -> str:
 
 
 def note_error(problem: object) -> None:
-    """Print an error to stderr, in one line."""
+    """Print `error: ` and the text of `problem` to stderr, in one line."""
     note("error: " + " ".join(str(problem).splitlines()))

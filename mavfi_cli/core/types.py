@@ -1,9 +1,9 @@
 """Messages between kernels, and the table of their monitored states.
 
 Messages are frozen records in SI units, ENU world frame and FLU body frame. A state is a scalar, or
-one component of a vector, that one kernel passes to the next. fi, detect and report iterate over
-the table. All reads and writes of a state go through it, so only the table depends on where the
-state is stored.
+one component of a vector, that one kernel passes to the next. The packages fi, detect and report
+iterate over the table. All reads and writes of a state go through it, so only the table depends on
+where the state is stored.
 Source of the list: the paper, sections IV-C and V-A, and the messages of its released code
 (MAVBench/MAV_apps, branch mavfi).
 """
@@ -32,12 +32,12 @@ class Stage(Enum):
 
     @property
     def states(self) -> tuple[State, ...]:
-        """The states that the stage outputs, in table order."""
+        """The states that the stage outputs, in the order of the table STATES."""
         return tuple(state for state in STATES if state.stage is self)
 
 
 class Outcome(Enum):
-    """Outcome of a mission."""
+    """How a mission ended."""
 
     SUCCESS = "success"
     COLLISION = "collision"
@@ -52,24 +52,25 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Briefing:
-    """Start, goal, flight bounds and camera of a mission, known before the flight."""
+    """What the companion knows about a mission before take-off: start, goal, bounds and camera."""
 
     start_enu_m: FloatArray  # (3,) on the ground
     goal_enu_m: FloatArray  # (3,)
     bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax of the allowed volume
     camera_offset_flu_m: FloatArray  # (3,) from the vehicle's centre to the optical centre
-    hfov_rad: float = math.pi / 2.0  # used until the camera reports its own
+    hfov_rad: float = math.pi / 2.0  # horizontal field of view, used until the camera reports one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightTruth:
-    """What the vehicle's side has recorded by the end of a flight.
+    """The true states and other data that the vehicle's side recorded during a flight.
 
     Attributes:
-        log: Columns of the referee, (n,) or (n, 3 or 4), one row per control tick.
+        log: The referee's log: columns of shape (n,), (n, 3) or (n, 4), with one row per control
+            tick, keyed by name.
         report: The referee's report: the section `referee` of a record, and the `world`.
-        stage_wall_s: Wall-clock time by part, s.
-        memory_mb: Peak memory of the process.
+        stage_wall_s: Wall-clock time, in seconds, of each part of the simulation.
+        memory_mb: Peak memory of the process, in MB.
     """
 
     log: Mapping[str, FloatArray]
@@ -80,7 +81,7 @@ class FlightTruth:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleState:
-    """State of the vehicle at one stamp, from its MAVLink messages."""
+    """The state of the vehicle at one time, as its MAVLink messages report it."""
 
     stamp_s: float  # vehicle boot clock
     position_enu_m: FloatArray  # (3,)
@@ -91,7 +92,7 @@ class VehicleState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DepthFrame:
-    """One depth image with the camera's pose when it was taken."""
+    """One depth image, and the pose of the camera when it was taken."""
 
     stamp_s: float
     depth_m: FloatArray  # (rows, columns) along the optical axis; inf where nothing was in range
@@ -102,7 +103,7 @@ class DepthFrame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointCloud:
-    """Points that a sensor measured, in the world frame."""
+    """The points that the depth camera measured in one frame, in the world frame."""
 
     stamp_s: float
     points_enu_m: FloatArray  # (n, 3)
@@ -111,7 +112,7 @@ class PointCloud:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CollisionReport:
-    """Result of the collision check of the whole remaining trajectory."""
+    """The result of checking the whole remaining trajectory for collisions with the map."""
 
     stamp_s: float
     collision: bool
@@ -124,7 +125,7 @@ WAYPOINT_FIELDS = ("x", "y", "z", "yaw", "vx", "vy", "vz", "ax", "ay", "az")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trajectory:
-    """A time-parametrised path of waypoints with equal or unequal durations."""
+    """A path of waypoints, each with a duration. Durations may be equal or unequal."""
 
     stamp_s: float  # start of the first waypoint
     waypoints: FloatArray  # (n, 10) in the order of WAYPOINT_FIELDS; m, rad, m/s, m/s^2, ENU
@@ -134,13 +135,13 @@ class Trajectory:
 
     @property
     def duration_s(self) -> float:
-        """Return the time from the start of the first waypoint to the end of the last, s."""
+        """The time, in seconds, from the start of the first waypoint to the end of the last."""
         return float(self.durations_s.sum())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
-    """Command of the control stage to the flight controller."""
+    """One command from the control stage to the autopilot: velocity, yaw and acceleration."""
 
     stamp_s: float
     velocity_enu_mps: FloatArray  # (3,)
@@ -152,7 +153,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Invocation:
-    """A row of the timetable: node, start and end of an invocation."""
+    """One invocation of a node in the timetable of a flight, with its simulated start and end."""
 
     node: str
     start_s: float
@@ -161,7 +162,7 @@ class Invocation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reaction:
-    """Response of the pipeline to one depth frame."""
+    """A depth frame and the first setpoint that depends on it, given by their stamps."""
 
     frame_stamp_s: float
     setpoint_stamp_s: float
@@ -169,10 +170,12 @@ class Reaction:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StackMark:
-    """Identity of the companion's stack. Error-free flights differ between stacks.
+    """The identity of a stack, or of a user's companion, to which a detector model belongs.
+
+    A model belongs to one stack, because error-free flights differ between stacks.
 
     Attributes:
-        digest: SHA-256 of its settings. Equal digests mean equal stacks.
+        digest: SHA-256 of the settings of the stack. Equal digests mean equal stacks.
     """
 
     name: str
@@ -187,7 +190,7 @@ _STAGES: dict[type[Message], Stage] = {
 
 
 class DType(Enum):
-    """Storage type of a state, or of a field of a message, whose bits a fault flips."""
+    """The storage type of a state, or of a field of a MAVLink message, whose bits a fault flips."""
 
     FLOAT64 = "float64"
     INT32 = "int32"
@@ -204,7 +207,7 @@ class DType(Enum):
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """A monitored inter-kernel state and injection site."""
+    """A monitored state: a scalar in a message between kernels, and a site to inject faults."""
 
     name: str
     message: type[Message]
@@ -225,12 +228,20 @@ class State:
         return _STAGES[self.message]
 
     def read(self, message: Message, index: int) -> Scalar:
-        """Return the value in a message; `index` is that of the waypoint."""
+        """Return the value of this state in a message.
+
+        Args:
+            index: Index of the waypoint; ignored for messages without waypoints.
+        """
         value: Any = getattr(message, self.source)
         return float(value[self._place(index)]) if isinstance(value, np.ndarray) else value
 
     def write(self, message: Message, index: int, value: Scalar) -> Message:
-        """Return a copy of a message with the value; `index` is that of the waypoint."""
+        """Return a copy of a message in which this state has another value.
+
+        Args:
+            index: Index of the waypoint; ignored for messages without waypoints.
+        """
         changed: Any = getattr(message, self.source)
         if isinstance(changed, np.ndarray):
             changed = changed.copy()
@@ -267,7 +278,7 @@ BY_NAME: dict[str, State] = {state.name: state for state in STATES}
 
 @dataclass(slots=True)
 class PilotCounters:
-    """Counters of the mission logic."""
+    """Counts of what the pilot did during a mission."""
 
     plans_requested: int = 0
     plans_failed: int = 0

@@ -39,7 +39,10 @@ _WORK = _B3 + COUNT
 
 @compiled
 def _reconstruction_error(memory: FloatArray, deltas: Codes) -> float:
-    """Return the mean squared reconstruction error. `memory[_WORK:]` is scratch space."""
+    """Return the mean squared reconstruction error of the scaled deltas.
+
+    `memory[_WORK:]` is scratch space.
+    """
     work = memory[_WORK:]
     for place in range(COUNT):
         work[place] = deltas[place] / memory[_SCALE + place]
@@ -72,7 +75,7 @@ def _judge_tick(
     yaw_rad: float,
     keep_report: bool,
 ) -> tuple[float, int]:
-    """Compute the deltas of a tick and their score; see `FittedDetector.tick_judge`."""
+    """Score the deltas of a control tick; see `FittedDetector.tick_judge`."""
     take_tick(waypoints, row, velocity_enu_mps, yaw_rad, keep_report, work)
     error = _reconstruction_error(memory, work[DELTA])
     return error, PASSED if error <= memory[0] else OF_CONTROL
@@ -88,7 +91,7 @@ def _judge_plan(
     changes: Codes,
     scores: FloatArray,
 ) -> int:
-    """Compute the steps of a plan and their scores; see `FittedDetector.plan_judge`."""
+    """Score the steps of a plan, and return their number; see `FittedDetector.plan_judge`."""
     count = plan_deltas(waypoints, first, work, steps, changes)
     for number in range(count):
         scores[number] = _reconstruction_error(memory, changes[number])
@@ -96,7 +99,7 @@ def _judge_plan(
 
 
 class AutoencoderDetector(FittedDetector):
-    """Autoencoder-based anomaly detection.
+    """Detector whose score is the reconstruction error of an autoencoder.
 
     Weight matrices have shape (outputs, inputs).
     """
@@ -110,5 +113,5 @@ class AutoencoderDetector(FittedDetector):
     plan_judge = staticmethod(_judge_plan)
 
     def score(self, deltas: Codes, stage: Stage) -> float:
-        """Return the reconstruction error: the mean squared error over the 13 scaled deltas."""
+        """Return the mean squared reconstruction error of the 13 scaled deltas."""
         return _reconstruction_error(self.flat, deltas)

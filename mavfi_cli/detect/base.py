@@ -44,7 +44,10 @@ PLUG_INS = PlugIns("mavfi.detectors", "detector")
 
 
 class Detector(Protocol):
-    """Scores deltas (COUNT,) int16 in the order of `preprocess.NAMES`; 0 means no change.
+    """A detector, which scores the changes of the monitored states.
+
+    The changes are deltas: an int16 array of shape (COUNT,) in the order of `preprocess.NAMES`. A
+    delta of 0 means no change.
 
     Attributes:
         per_stage: True if each stage is scored alone and an alarm recomputes that stage. False if
@@ -60,28 +63,28 @@ class Detector(Protocol):
 
     @property
     def memory(self) -> Mapping[str, NDArray[Any]]:
-        """All state of the detector, including the threshold, as writable arrays."""
+        """All state of the detector, including the threshold, as writable arrays keyed by name."""
 
     def score(self, deltas: Codes, stage: Stage) -> float:
-        """Return the anomaly score of a sample.
+        """Return the anomaly score of a sample. A higher score is more anomalous.
 
         Args:
-            deltas: Deltas of all states; 0 for states without a new sample.
+            deltas: Deltas of all states. They are 0 for states without a new sample.
             stage: Stage to score if `per_stage`, otherwise the stage of the message.
         """
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
-        """Update the model with an accepted sample. A fixed model does nothing."""
+        """Update the model with a sample that the gate accepted. A fixed model does nothing."""
 
 
 def find_detector(
     name: str, *, model: Path | None = None, threshold: float | None = None
 ) -> Detector:
-    """Create a new detector by name.
+    """Create a new detector of the kind `name`.
 
     Args:
-        model: Model file; None selects the shipped one.
-        threshold: Replaces the model's threshold; a number of sigmas for `gad`.
+        model: Path of a model file; None selects the one shipped for the default stack.
+        threshold: Threshold that replaces the model's; for `gad`, a number of sigmas.
 
     Raises:
         UnknownName: No detector has this name. The message suggests the nearest.
@@ -125,14 +128,17 @@ class Model:
 
     @property
     def training_flights(self) -> list[str]:
-        """Flights (`world/seed`) that the model was fitted to, from all parts of its split."""
+        """Names (`world/seed`) of the flights that the model was fitted to, in all its parts.
+
+        The parts are those for training, validation and the threshold.
+        """
         parts = self.provenance.get("split", {})
         if not isinstance(parts, Mapping):
             return []
         return [str(flight) for part in parts.values() for flight in part]
 
     def save(self, path: Path) -> None:
-        """Write the model atomically.
+        """Write the model to a file, atomically.
 
         Raises:
             ModelError: A number is not finite. Nothing is written.
@@ -172,21 +178,24 @@ class Model:
         return model
 
     def incompatibility(self, detector: str, shapes: Mapping[str, tuple[int, ...]]) -> str:
-        """Return the reason why a detector cannot use the model; empty if it can."""
+        """Return the reason why `detector` cannot use the model, or an empty string if it can.
+
+        `shapes` are the shapes of the arrays that the detector needs, keyed by name.
+        """
         names = [state.name for state in EXTENDED]
         if self.mavfi != version("mavfi"):
             return f"must be made for mavfi {version('mavfi')!r}, got {self.mavfi!r}"
         if self.detector != detector:
             return f"must be made for detector {detector!r}, got {self.detector!r}"
         if self.states != STATES_DIGEST:
-            return "made for another table of states; train it again"
+            return "made for another table of states; fit a new model with mavfi train"
         if self.preprocess_digest != self.preprocess.digest():
-            return "made with another preprocessing; train it again"
+            return "made with another preprocessing; fit a new model with mavfi train"
         if set(self.extended) != set(names):
             return f"corrupt model file: extended must be {', '.join(names)}"
         for name, (low, high) in self.extended.items():
             if not -LIMIT <= low <= 0 <= high <= LIMIT:
-                return f"corrupt model file: extended: {name} is not a range"
+                return f"corrupt model file: extended: {name} must be an int16 range including 0"
         if set(self.arrays) != set(shapes):
             return f"corrupt model file: arrays must be {', '.join(shapes)}"
         return ""
@@ -198,13 +207,13 @@ def _require_finite(name: str, array: FloatArray, path: Path) -> None:
 
 
 def shipped(detector: str, stack: str = DEFAULT_STACK) -> Path:
-    """Return the path of a detector's shipped model for a stack. The file may not exist."""
+    """Return the path of the shipped model of a detector for a stack. The file may not exist."""
     return SHIPPED / stack / f"{detector}.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorListing:
-    """A detector with one of its models, or with none, as a row of `listing`."""
+    """One row of `listing`: a detector, and one of its models if it has any."""
 
     name: str
     model: str | None = None  # path of the model file
@@ -215,10 +224,10 @@ class DetectorListing:
 
 
 def listing(models: Path | None = None) -> list[DetectorListing]:
-    """List every detector once per model; a detector without a model has one row.
+    """Return one row per model of each detector, and one row for a detector without a model.
 
     Args:
-        models: Folder of model files `NAME.json`; None selects the shipped ones.
+        models: Folder of model files `NAME.json`; None selects the shipped models.
     """
     rows = []
     for name in PLUG_INS.names:
@@ -265,18 +274,20 @@ PASSED, OF_PLANNING, OF_CONTROL = range(3)  # stage with a score above the thres
 
 
 class FittedDetector:
-    """A detector with its state in one flat array, which compiled code takes as one argument.
+    """Base class of our detectors, which keep all their state in one flat array.
 
     Attributes:
         flat: The whole memory as one array, which is passed to compiled code.
-        shapes: Names and shapes of the parts of the memory, in order. The first part is the
+        shapes: Names and shapes of the arrays in the memory, in order. The first array is the
             threshold, a single number.
-        divisors: Parts, besides the threshold, whose numbers must all be above 0.
-        scratch: Number of scratch elements, which follow the parts, for compiled code.
+        divisors: Arrays, besides the threshold, whose numbers must all be above 0.
+        scratch: Number of scratch elements for compiled code, at the end of `flat`.
         stack: Stack of the flights that the model was fitted to; None without a model file.
         extended: Ranges of the extended states in these flights; None without a model file.
-        tick_judge: Calls `preprocess.take_tick`, then scores and learns as the gate does.
-        plan_judge: Calls `preprocess.plan_deltas`, then scores each step that it returns.
+        tick_judge: Compiled function that calls `preprocess.take_tick`, then scores and learns as
+            the gate does; None if the detector has none.
+        plan_judge: Compiled function that calls `preprocess.plan_deltas`, then scores each step
+            that this returns; None if the detector has none.
     """
 
     name: ClassVar[str]
@@ -295,7 +306,10 @@ class FittedDetector:
 
     @property
     def memory(self) -> Mapping[str, FloatArray]:
-        """Writable views of the detector's state. A change takes effect at the next sample."""
+        """Writable views of the detector's state, keyed by name.
+
+        A change takes effect at the next sample.
+        """
         views, start = {}, 0
         for name, shape in self.shapes.items():
             end = start + math.prod(shape)
@@ -305,14 +319,14 @@ class FittedDetector:
 
     @property
     def threshold(self) -> float:
-        """Threshold. A score above it raises an alarm."""
+        """The threshold. A score above it, or a NaN score, raises an alarm."""
         return self.flat.item(0)
 
     @classmethod
     def build(cls, *, model: Path | None = None, threshold: float | None = None) -> Self:
-        """Create the detector from a model file; see `find_detector`.
+        """Create the detector from a model file. The arguments are those of `find_detector`.
 
-        Without a file it uses the model shipped for the default stack.
+        Without a model file, the detector uses the model shipped for the default stack.
         """
         path = shipped(cls.name) if model is None else model
         loaded = Model.read(path)
@@ -324,7 +338,10 @@ class FittedDetector:
 
     @classmethod
     def _arrays(cls, model: Model, path: Path) -> dict[str, FloatArray]:
-        """Return the arrays of a model. Raise ModelError if this detector cannot use it."""
+        """Return the arrays of a model, keyed by name.
+
+        Raises ModelError if this detector cannot use the model.
+        """
         if problem := model.incompatibility(cls.name, cls.shapes):
             raise ModelError(problem, path=path)
         arrays = {}

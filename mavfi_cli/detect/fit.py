@@ -48,12 +48,12 @@ _YAW = [NAMES.index("waypoint_yaw"), NAMES.index("command_yaw")]
 
 
 def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) -> None:
-    """Check the arguments of `fit`, if possible before the flights are flown.
+    """Check the arguments of `fit`, so that errors appear before any flight is flown.
 
     Raises:
         UnknownName: A kind is unknown.
         ModelError: There are too few flights, or torch is missing for aad.
-        ConfigError: n sigma is out of range.
+        ConfigError: `n_sigma` is not a finite number above 0.
     """
     for kind in kinds:
         if kind not in KINDS:
@@ -67,7 +67,7 @@ def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) ->
 
 
 def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = None) -> Model:
-    """Fit one kind of detector. Raises the same errors as `check`.
+    """Fit a model of one kind of detector to a data set. Raises the same errors as `check`.
 
     Args:
         n_sigma: Threshold of the Gaussian model. None selects the smallest integer that is at least
@@ -114,7 +114,11 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
 
 
 def _split(dataset: Dataset, seed: int) -> dict[str, list[int]]:
-    """Split the flights, in similar proportions for each world. Return their indices by use."""
+    """Split the flights into the parts `train`, `validation` and `threshold`.
+
+    The proportions are similar for each world. Return the indices of the flights in each part,
+    keyed by the part's name.
+    """
     drawn = Stream.MISSION.generator(seed, "detector-split").permutation(len(dataset))
     worlds = [dataset.flights[place].world for place in drawn]
     ordered = [int(drawn[i]) for i in sorted(range(len(drawn)), key=lambda i: (worlds[i], i))]
@@ -125,10 +129,11 @@ def _split(dataset: Dataset, seed: int) -> dict[str, list[int]]:
 
 
 def _scale_of(flights: Sequence[FlightSamples]) -> FloatArray:
-    """Return the largest |delta| in each state's group (COUNT,), at least `_LEAST_SCALE`.
+    """Return the scale (COUNT,) of each state: the largest |delta| in its group of states.
 
-    The scaled inputs lie within about +-1. The components of a vector share one scale, because each
-    component may take the values of the others.
+    A scale is never below the state's entry in `_LEAST_SCALE`. The scaled inputs lie within about
+    +-1. The components of a vector share one scale, because each component may take the values of
+    the others.
     """
     largest = np.maximum(np.abs(_mirrored(flights)).max(axis=0), _LEAST_SCALE)
     groups = np.array([state.group for state in DETECTED])
@@ -157,9 +162,9 @@ def _mirrored(flights: Sequence[FlightSamples]) -> NDArray[np.int64]:
 
 
 def _largest(detector: Detector, flights: Sequence[FlightSamples]) -> float:
-    """Return the largest score of the flights.
+    """Return the largest score that the detector gives to a sample of the flights.
 
-    For a detector with one score over all states, mirror images are included.
+    For a detector with one score over all states, mirror images of the samples are included.
     """
     if detector.per_stage:
         return max(float(flight.scores(detector).max(initial=0.0)) for flight in flights)
@@ -168,7 +173,10 @@ def _largest(detector: Detector, flights: Sequence[FlightSamples]) -> float:
 
 
 def _extended_ranges(flights: Sequence[FlightSamples]) -> Ranges:
-    """Return the smallest and largest change of each extended state; ranges include 0."""
+    """Return the smallest and largest change of each extended state in the flights.
+
+    The ranges are keyed by the state's name, and always include 0.
+    """
     rows = np.concatenate([flight.extended for flight in flights])
     return {
         state.name: (min(0, *column), max(0, *column))
@@ -205,7 +213,10 @@ Trained = tuple[dict[str, FloatArray], dict[str, Any]]  # weights by name, and t
 
 
 def _train_autoencoder(inputs: FloatArray, validation: FloatArray, seed: int) -> Trained:
-    """Train on scaled vectors (n, 13); return the weights best on validation vectors (m, 13)."""
+    """Train an autoencoder on scaled deltas (n, 13) from several starts, and return the best.
+
+    The best weights have the smallest largest error on the scaled deltas `validation` (m, 13).
+    """
     import torch
 
     threads = torch.get_num_threads()
@@ -228,7 +239,7 @@ def _train_once(torch: Any, inputs: FloatArray, validation: FloatArray, seed: in
         weights[f"{name}_biases"] = torch.zeros(after, dtype=torch.float64).requires_grad_()
 
     def loss_of(rows: Any) -> Any:
-        """Return the mean squared errors (n,) of vectors (n, COUNT)."""
+        """Return the mean squared reconstruction error (n,) of each vector in `rows` (n, COUNT)."""
         hidden = torch.tanh(rows @ weights["hidden_weights"].T + weights["hidden_biases"])
         coded = torch.tanh(hidden @ weights["coded_weights"].T + weights["coded_biases"])
         output = coded @ weights["output_weights"].T + weights["output_biases"]

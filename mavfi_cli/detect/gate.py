@@ -39,7 +39,7 @@ _Tick = tuple[FloatArray, int, FloatArray, float, bool]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Alarm:
-    """Alarm about an anomalous message."""
+    """An alarm about an anomalous message, raised by the detector or by the extended watch."""
 
     stage: Stage  # stage to recompute
     detector: str
@@ -59,8 +59,9 @@ class _ExtendedWatch:
     effect. So after n messages that were not accepted, the sum of n + 1 changes is allowed.
 
     Attributes:
-        memory: Last accepted codes, smallest and largest changes, (3, 3) int16 with one column per
-            state. A modification takes effect at once.
+        memory: Array (3, 3), int16, with one column per state. Its rows are the last accepted
+            codes, the smallest changes and the largest changes. A modification takes effect at
+            once.
     """
 
     def __init__(self, ranges: preprocess.Ranges) -> None:
@@ -70,7 +71,10 @@ class _ExtendedWatch:
         self._accepted: dict[float, Trajectory] = {}  # plans by their stamps
 
     def judge(self, message: CollisionReport | Trajectory) -> Alarm | None:
-        """Judge a message on arrival. The caller must then call `accept` or `lose`."""
+        """Judge a message on arrival, and return an alarm, or None if the message passes.
+
+        The caller must then call `accept` or `lose`.
+        """
         return self._judge(message, self.memory[0].tolist(), self._lost[type(message)] + 1)
 
     def accept(self, message: CollisionReport | Trajectory) -> None:
@@ -86,7 +90,10 @@ class _ExtendedWatch:
         self._lost[kind] += 1
 
     def judge_flown(self, plan: Trajectory) -> Alarm | None:
-        """Judge the active plan, whose states may have changed since it was accepted."""
+        """Judge the active plan again, because its states may have changed since it was accepted.
+
+        Return an alarm with the plan reset to the accepted states, or None if the plan passes.
+        """
         accepted = self._accepted.get(plan.stamp_s)
         if accepted is None:
             return None
@@ -126,11 +133,13 @@ class _ExtendedWatch:
 
 
 class Gate:
-    """The gate of one mission.
+    """The gate of one mission, which checks every message before it takes effect.
+
+    The methods that judge a message return an alarm, or None if the message passes.
 
     Args:
         detector: New detector for this mission only, because it learns.
-        protect: Stages to watch. The deltas of the others stay 0.
+        protect: Stages to watch. The deltas of the other stages stay 0.
         params: Preprocessing parameters; must be those of the detector's model.
         extended: Ranges of the extended states to watch; None watches none of them.
 
@@ -169,18 +178,21 @@ class Gate:
 
     @property
     def deltas(self) -> Codes:
-        """Copy of the detector's last input (COUNT,)."""
+        """Copy of the deltas (COUNT,) of the report or control tick that was judged last."""
         deltas: Codes = self._deltas.copy()
         return deltas
 
     @property
     def memory(self) -> Mapping[str, NDArray[Any]]:
-        """All state of detector and gate as writable arrays, into which faults can be injected."""
+        """All state of the detector and the gate, as writable arrays keyed by name.
+
+        Faults can be injected into these arrays.
+        """
         own = {"gate": self._work} | ({} if self._watch is None else {"watch": self._watch.memory})
         return {**own, **self.detector.memory}
 
     def judge_report(self, report: CollisionReport) -> Alarm | None:
-        """Judge a collision report on arrival."""
+        """Judge a collision report on arrival. Return an alarm, or None if the report passes."""
         preprocess.take_report(report.time_to_collision_s, report.future_collision_seq, self._work)
         self.fresh = (Stage.PERCEPTION,)
         self._pending = False
@@ -201,10 +213,10 @@ class Gate:
         return self._settled(report, alarm)
 
     def judge_plan(self, trajectory: Trajectory) -> Alarm | None:
-        """Judge a published plan: all steps from waypoint to waypoint, and the extended states.
+        """Judge a published plan: its extended states, and all steps from waypoint to waypoint.
 
-        Only per-stage detectors judge the steps here. An alarm of a detector over all stages would
-        recompute control, but there is no command to recompute yet; see `judge_ahead`.
+        The steps are judged here only if the detector is per-stage. An alarm of a detector over all
+        stages would recompute control, but there is no command to recompute yet; see `judge_ahead`.
         """
         if Stage.PLANNING not in self.protect:
             return None
@@ -214,7 +226,7 @@ class Gate:
         return self._settled(trajectory, alarm)
 
     def _settled(self, message: CollisionReport | Trajectory, alarm: Alarm | None) -> Alarm | None:
-        """Tell the extended watch whether a judged message passed. Return the alarm."""
+        """Tell the extended watch whether a judged message passed, and return `alarm`."""
         if self._watch is not None:
             self._watch.accept(message) if alarm is None else self._watch.lose(type(message))
         return alarm
@@ -233,7 +245,7 @@ class Gate:
 
         Returns:
             An alarm about extended states that differ too much from those of the accepted plan, or
-            about the first bad step, with the waypoint to drop; None without either.
+            about the first anomalous step, with the waypoint to drop; None if both pass.
         """
         if Stage.PLANNING not in self.protect:
             return None
@@ -256,7 +268,11 @@ class Gate:
         return self._alarm(stage, scores[number], deltas, waypoint)
 
     def _score_steps(self, trajectory: Trajectory, first: int) -> list[float]:
-        """Score the steps that change a code; write steps and deltas to `_steps` and `_changes`."""
+        """Score those steps of a plan that change a code, starting at waypoint `first`.
+
+        Return their scores. The numbers of these steps and their deltas are written to `_steps` and
+        `_changes`.
+        """
         waypoints = trajectory.waypoints
         if len(waypoints) > len(self._steps):
             self._steps = np.empty(len(waypoints), np.int64)
@@ -277,8 +293,9 @@ class Gate:
     ) -> Alarm | None:
         """Judge the current waypoint and the command, before the command is sent.
 
-        A waypoint is a new sample if its trajectory or index differs from that of the last accepted
-        one. If its stage raises an alarm, the command computed from it is not judged.
+        Return an alarm, or None if both pass. A waypoint is a new sample if its trajectory or index
+        differs from that of the last accepted one. If its stage raises an alarm, the command
+        computed from it is not judged.
         """
         if trajectory is None or (trajectory is self._trajectory and index == self._index):
             waypoints, row = _NO_WAYPOINTS, -1
@@ -305,7 +322,10 @@ class Gate:
     def _judge_stages(
         self, _flat: FloatArray | None, work: Codes, *tick: *_Tick
     ) -> tuple[float, int]:
-        """Judge a tick without `tick_judge`: the detector has none, or a stage is not watched."""
+        """Judge a control tick if the detector has no `tick_judge`, or if a stage is not watched.
+
+        Return the score and the stage of an alarm, or 0 and PASSED without one.
+        """
         preprocess.take_tick(*tick, work)
         for span in self._ignored:
             self._deltas[span] = 0
@@ -319,7 +339,7 @@ class Gate:
         return 0.0, PASSED
 
     def accept_report(self) -> None:
-        """Accept the last judged report despite its alarm. It becomes the reference."""
+        """Accept the last judged report despite its alarm, so that it becomes the reference."""
         self._refer(Stage.PERCEPTION, preprocess.CODE)
         if self._watch is not None and self._report is not None:
             self._watch.accept(self._report)
@@ -330,7 +350,10 @@ class Gate:
             self._watch.accept(trajectory)
 
     def accept_tick(self) -> None:
-        """Accept the last judged waypoint and command despite an alarm."""
+        """Accept the last judged waypoint and command despite their alarm.
+
+        They become the reference.
+        """
         for stage in self.fresh:
             if stage is not Stage.PERCEPTION:
                 self._refer(stage, preprocess.CODE)
@@ -338,7 +361,7 @@ class Gate:
             self._trajectory, self._index = self._judged
 
     def _refer(self, stage: Stage, row: int) -> None:
-        """Make a row of the working array the reference of a stage."""
+        """Copy a row of the working array to the references of a stage's states."""
         first, end = SPANS[stage]
         self._work[preprocess.REFERENCE, first:end] = self._work[row, first:end]
 
@@ -356,7 +379,10 @@ class Gate:
         )
 
     def _blame(self, stage: Stage, threshold: float, deltas: Codes) -> tuple[str, ...]:
-        """Return the states that are anomalous on their own, else all changed ones; worst first."""
+        """Return the names of the states that would raise an alarm on their own, worst first.
+
+        If there is no such state, return the names of all changed states, worst first.
+        """
         first, end = SPANS[stage] if self._per_stage else (0, COUNT)
         alone: list[tuple[float, int]] = []
         for place in range(first, end):

@@ -43,7 +43,11 @@ _PLANNING, _CONTROL = SPANS[Stage.PLANNING]
 
 @compiled
 def _farthest(memory: FloatArray, deltas: Codes, first: int, end: int) -> float:
-    """Return the largest distance from the mean in sigmas; NaN if a model is corrupted."""
+    """Return the largest distance of a delta from its mean, in sigmas.
+
+    Only states from `first` up to but not including `end` count. The result is NaN if the model of
+    one of them is corrupted.
+    """
     worst = 0.0
     for place in range(first, end):
         count = memory[_COUNT + place]
@@ -84,7 +88,10 @@ def _judge_tick(
     yaw_rad: float,
     keep_report: bool,
 ) -> tuple[float, int]:
-    """Score and learn the deltas of a tick per stage; see `FittedDetector.tick_judge`."""
+    """Score the deltas of a control tick stage by stage, and learn from them if they pass.
+
+    See `FittedDetector.tick_judge`.
+    """
     take_tick(waypoints, row, velocity_enu_mps, yaw_rad, keep_report, work)
     deltas = work[DELTA]
     if row >= 0:
@@ -109,7 +116,7 @@ def _judge_plan(
     changes: Codes,
     scores: FloatArray,
 ) -> int:
-    """Compute the steps of a plan and their scores; see `FittedDetector.plan_judge`."""
+    """Score the steps of a plan, and return their number; see `FittedDetector.plan_judge`."""
     count = plan_deltas(waypoints, first, work, steps, changes)
     for number in range(count):
         scores[number] = _farthest(memory, changes[number], _PLANNING, _CONTROL)
@@ -117,7 +124,7 @@ def _judge_plan(
 
 
 class GaussianDetector(FittedDetector):
-    """Gaussian-based anomaly detection."""
+    """Detector with an online Gaussian model of the deltas of each state."""
 
     name: ClassVar[str] = "gad"
     per_stage = True
@@ -134,7 +141,7 @@ class GaussianDetector(FittedDetector):
 
     @classmethod
     def cold(cls, n_sigma: float = N_SIGMA) -> GaussianDetector:
-        """Create a detector that has not learned from any sample."""
+        """Create a detector that has not learned from any sample yet."""
         arrays = {name: np.zeros(shape) for name, shape in cls.shapes.items()}
         arrays["n_sigma"][0] = n_sigma
         for stage, floor in SIGMA_FLOORS.items():
@@ -147,6 +154,6 @@ class GaussianDetector(FittedDetector):
         return _farthest(self.flat, deltas, first, end)
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
-        """Apply equations 1 and 2 to each state of the stage."""
+        """Update the mean and the sum of squares of each state of the stage (equations 1 and 2)."""
         first, end = span(stage)
         _welford(self.flat, deltas, first, end)

@@ -20,7 +20,7 @@ class NormDetector(FittedDetector):
     divisors: ClassVar[tuple[str, ...]] = ("scale",)
 
     def score(self, deltas: Codes, stage: Stage) -> float:
-        """Return the norm of the scaled deltas."""
+        """Return the Euclidean norm of all deltas, each divided by its scale."""
         return _norm(self.flat, deltas)
 
 

@@ -49,7 +49,7 @@ _COMMAND = list(NAMES[slice(*SPANS[Stage.CONTROL])])
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanStrike:
-    """A value that a fault changed in the active plan."""
+    """A change that a fault made to one value of the active plan."""
 
     stamp_s: float
     state: str
@@ -69,7 +69,10 @@ class _Judgement:
 
 
 class _Probe:
-    """Wraps a detector or None, and keeps the highest score since the last `take_highest`."""
+    """Wraps a detector, and stores its highest score since the last `take_highest`.
+
+    If the detector is None, every score is 0 and raises no alarm.
+    """
 
     def __init__(self, detector: Detector | None) -> None:
         self._detector = detector
@@ -80,7 +83,7 @@ class _Probe:
         self.highest = -np.inf
 
     def score(self, deltas: Codes, stage: Stage) -> float:
-        """Return the detector's score, or 0 without a detector. Keep it if it is highest or NaN."""
+        """Return the detector's score. If it is the highest so far, or NaN, store it."""
         score = 0.0 if self._detector is None else self._detector.score(deltas, stage)
         if not score <= self.highest:
             self.highest = score
@@ -92,7 +95,7 @@ class _Probe:
             self._detector.learn(deltas, stage)
 
     def take_highest(self) -> float:
-        """Return the highest score since the last call; minus infinity if there was none."""
+        """Return the highest score since the last call, or minus infinity if nothing was scored."""
         highest, self.highest = self.highest, -np.inf
         return highest
 
@@ -107,9 +110,9 @@ def replay(
     plans: Sequence[Trajectory] = (),
     strikes: Sequence[PlanStrike] = (),
 ) -> Iterator[_Judgement]:
-    """Judge every message of a trace in the order of arrival.
+    """Judge every message of a trace in the order of arrival, and yield each judgement.
 
-    Nothing is recomputed: the messages are always those of the flight.
+    Nothing is recomputed after an alarm: the messages are always those of the recorded flight.
 
     Args:
         detector: New detector; None computes only the deltas.
@@ -170,7 +173,10 @@ class _FlownPlans:
         self._waypoints = _reals(trace["waypoint_index"])
 
     def ahead(self, row: int, stamp_s: float) -> tuple[Trajectory, int] | None:
-        """Return the plan to judge and its current waypoint; None if there is none to judge."""
+        """Return the active plan and its current waypoint's index, or None if no judgement is due.
+
+        A judgement is due if the plan or the waypoint has changed since the last call.
+        """
         if not self._plans:
             return None
         while self._strikes and self._strikes[0].stamp_s <= stamp_s + 1e-9:
@@ -219,7 +225,7 @@ class _Messages:
         self._collisions = np.isfinite(self._reports[:, 0]) if collision is None else collision
 
     def report(self, row: int) -> CollisionReport | None:
-        """Return the report that took effect in this tick, or None."""
+        """Return the collision report that took effect in this tick, or None if none did."""
         if not self._new_report[row]:
             return None
         time_s, seq = self._reports[row].tolist()
@@ -231,7 +237,10 @@ class _Messages:
         )
 
     def waypoint(self, row: int) -> Trajectory | None:
-        """Return a trajectory with only the current waypoint: the same object until it changes."""
+        """Return a trajectory that has only the current waypoint, or None if there is none.
+
+        It is the same object until the waypoint changes.
+        """
         if self._new_waypoint[row]:
             self._trajectory = Trajectory(
                 stamp_s=self.stamps_s[row],
@@ -243,7 +252,7 @@ class _Messages:
         return self._trajectory if self._has_waypoint[row] else None
 
     def command(self, row: int) -> Command | None:
-        """Return the command of this tick, or None before the first."""
+        """Return the command of this tick, or None before the first command."""
         if not self._has_command[row]:
             return None
         return Command(
@@ -258,14 +267,17 @@ def _reals(column: NDArray[Any]) -> FloatArray:
 
 
 def _present(column: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return True for rows with a value: not masked, and not NaN in a plain array."""
+    """Return, for each row, True if it has a value.
+
+    A row without a value is masked or, in an array without a mask, NaN.
+    """
     if isinstance(column, np.ma.MaskedArray):
         return ~np.ma.getmaskarray(column)
     return ~np.isnan(_reals(column))
 
 
 def _changes(values: FloatArray, trace: Columns, markers: tuple[str, ...]) -> NDArray[np.bool_]:
-    """Return True for rows (n,) whose values or marker columns differ from the previous row."""
+    """Return, for each row, True if its values or its markers differ from the previous row's."""
     marked = [_reals(trace[name]) for name in markers if name in trace]
     patterns = np.column_stack([values, *marked]).view(np.int64)  # NaN equals itself
     changed = np.ones(len(patterns), np.bool_)
@@ -274,7 +286,10 @@ def _changes(values: FloatArray, trace: Columns, markers: tuple[str, ...]) -> ND
 
 
 def columns_of(table: Any) -> dict[str, NDArray[Any]]:
-    """Return the columns of an Arrow table as masked arrays, which distinguish NaN from null."""
+    """Return the columns of an Arrow table, except text, as masked arrays keyed by name.
+
+    Masked arrays distinguish NaN from null.
+    """
     columns: dict[str, NDArray[Any]] = {}
     for name in table.column_names:
         column = table[name].combine_chunks()
@@ -308,9 +323,10 @@ class FlightSamples:
     def of_ticks(
         cls, ticks: Iterable[tuple[float, Trajectory | None, Command]], world: str, seed: int
     ) -> FlightSamples:
-        """Extract the samples of a flight from its control ticks: stamp, waypoint, command.
+        """Extract the samples of a flight from its control ticks.
 
-        A waypoint is a trajectory with one row, and is the same object until it changes.
+        Each tick consists of its stamp, waypoint and command. The waypoint is a trajectory with one
+        row, and is the same object until it changes.
         """
         gate, rows = Gate(_Probe(None)), []
         for stamp_s, trajectory, command in ticks:
@@ -376,7 +392,7 @@ class FlightSamples:
         return self.deltas[~(self.reports | self.plan_steps)]
 
     def scores(self, detector: Detector) -> FloatArray:
-        """Return the score of every judged message (n,): the highest score of its stages."""
+        """Return the score of every sample, (n,): the highest score among the sample's stages."""
         scores = np.zeros(len(self.deltas))
         flags = (self.reports, self.plan_steps, self.new_waypoint)
         rows = zip(self.deltas, *(flag.tolist() for flag in flags), strict=True)
@@ -402,7 +418,10 @@ def _plan_steps(plan: Trajectory, params: PreprocessParams) -> Codes:
 
 
 def _extended_changes(messages: Sequence[CollisionReport | Trajectory]) -> Codes:
-    """Return the changes (n, 3) of the extended states between successive messages of a kind."""
+    """Return the changes (n, 3) of the extended states from message to message.
+
+    The messages must be of one kind. The states of the first are compared with 0.
+    """
     changes = np.zeros((len(messages), len(EXTENDED)), np.int16)
     before = [0] * len(EXTENDED)
     for row, message in enumerate(messages):
@@ -415,7 +434,7 @@ def _extended_changes(messages: Sequence[CollisionReport | Trajectory]) -> Codes
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dataset:
-    """Flights with distinct combinations of world and seed."""
+    """The samples of several flights, each with a different combination of world and seed."""
 
     flights: tuple[FlightSamples, ...]
     preprocess: PreprocessParams
@@ -450,14 +469,14 @@ class Dataset:
 
     @classmethod
     def load(cls, path: Path, preprocess: PreprocessParams | None = None) -> Dataset:
-        """Read a data set.
+        """Read a data set from a file that `save` has written.
 
         Args:
             preprocess: Parameters that the data set must have been made with.
 
         Raises:
             RecordError: The file is unreadable.
-            ModelError: It is not a data set, or was made with another schema, state table or
+            ModelError: The file is not a data set, or was made with another schema, state table or
                 preprocessing.
         """
         params = preprocess or PreprocessParams()

@@ -44,7 +44,7 @@ COUNT = len(DETECTED)
 EXTENDED = tuple(
     BY_NAME[name] for name in ("collision", "plan_trajectory_seq", "plan_future_collision_seq")
 )
-Ranges = dict[str, tuple[int, int]]  # smallest and largest change of each extended state by name
+Ranges = dict[str, tuple[int, int]]  # name of an extended state -> smallest and largest change
 
 LIMIT = 32767  # maximum of a code and of a delta
 UNKNOWN = -32768  # reference of a state without an accepted sample
@@ -71,7 +71,10 @@ _PLANNING, _CONTROL = SPANS[Stage.PLANNING][0], SPANS[Stage.CONTROL][0]
 
 
 def span(stage: Stage) -> tuple[int, int]:
-    """Return the first index of a stage and the index after its last, without a lookup in SPANS."""
+    """Return the first index of a stage among the detected states, and the index after its last.
+
+    The result equals `SPANS[stage]`, but needs no dictionary.
+    """
     if stage is _PLANNING_STAGE:
         return _PLANNING, _CONTROL
     return (0, _PLANNING) if stage is _PERCEPTION_STAGE else (_CONTROL, COUNT)
@@ -87,7 +90,7 @@ STATES_DIGEST = _digest([[s.name, s.stage.value, s.dtype.value, s.unit] for s in
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreprocessParams:
-    """Floor exponent of each group of states, and the ceiling of `time_to_collision`.
+    """The floor exponent of each group of states, and the ceiling exponent of `time_to_collision`.
 
     A floor is close to the largest change between two samples in error-free flight: 1.5 m between
     waypoints, 0.1 m/s between commands 20 ms apart. A command changes by more only at the start or
@@ -112,11 +115,11 @@ class PreprocessParams:
             raise ConfigError(problem, key="time_to_collision_ceiling")
 
     def working_array(self) -> Codes:
-        """Create the working array (ROWS, COUNT) for the functions below, with no references yet.
+        """Create the working array (ROWS, COUNT) that the functions of this module read and write.
 
-        Row REFERENCE holds the reference codes of the deltas, PREVIOUS the reference codes before
-        the last sample, CODE and DELTA the codes and deltas of the last sample. FLOOR, CEILING and
-        KIND define the encoding.
+        No state has a reference yet. Row REFERENCE holds the reference codes of the deltas,
+        PREVIOUS the reference codes before the last sample, CODE and DELTA the codes and deltas of
+        the last sample. FLOOR, CEILING and KIND define the encoding.
         """
         columns = []
         for state in DETECTED:
@@ -134,12 +137,12 @@ class PreprocessParams:
         return work
 
     def digest(self) -> str:
-        """Return the SHA-256 of the parameters and of the name of the coding."""
+        """Return the SHA-256 of the parameters and of the coding's name, as hexadecimal text."""
         return _digest({"coding": "signed log-magnitude", **asdict(self)})
 
 
 def extended_codes(message: Message) -> list[tuple[int, int]]:
-    """Return the index in EXTENDED and the code of each extended state of a message."""
+    """Return, for each extended state in a message, its index in EXTENDED and its code."""
     return [
         (place, min(max(int(state.read(message, 0)), -LIMIT), LIMIT))
         for place, state in enumerate(EXTENDED)
@@ -161,7 +164,7 @@ def _encode(value: float, floor: int, ceiling: int, kind: int) -> int:
 
 @compiled
 def _take(work: Codes, place: int, value: float) -> None:
-    """Encode a new sample of a state and make it the reference."""
+    """Encode a new sample of the state at index `place`, and make it the state's reference."""
     floor, kind = work[FLOOR, place], work[KIND, place]
     code = _encode(value, floor, work[CEILING, place], kind)
     before = work[REFERENCE, place]
@@ -173,7 +176,10 @@ def _take(work: Codes, place: int, value: float) -> None:
 
 @compiled
 def _difference(before: int, code: int, floor: int, kind: int) -> int:
-    """Return the saturated delta of two codes; 0 without a reference or if yaw has wrapped."""
+    """Return the delta between two codes, saturated to 16 bits.
+
+    The delta is 0 if there is no reference code, or if a yaw has wrapped.
+    """
     if before == UNKNOWN:
         return 0
     if kind == _ANGLE:
@@ -185,7 +191,7 @@ def _difference(before: int, code: int, floor: int, kind: int) -> int:
 
 @compiled
 def take_report(time_to_collision_s: float, future_collision_seq: float, work: Codes) -> None:
-    """Compute the deltas of a collision report. Those of the other stages become 0."""
+    """Write the deltas of a collision report to `work`, and set those of other stages to 0."""
     _take(work, 0, time_to_collision_s)
     _take(work, 1, future_collision_seq)
     work[DELTA, _PLANNING:] = 0
@@ -200,10 +206,11 @@ def take_tick(
     keep_report: bool,
     work: Codes,
 ) -> None:
-    """Compute the deltas of a control tick from row `index` of `waypoints` (n, 10) and a command.
+    """Write the deltas of a control tick to `work`: those of its waypoint and of its command.
 
-    A negative `index` means no waypoint. The deltas of the last report stay if `keep_report` is set
-    and become 0 otherwise.
+    The waypoint is row `index` of `waypoints` (n, 10). A negative `index` means that no waypoint is
+    new, so the planning deltas become 0. The deltas of the last report stay if `keep_report` is
+    set, and become 0 otherwise.
     """
     if not keep_report:
         work[DELTA, :_PLANNING] = 0
@@ -225,7 +232,7 @@ def plan_deltas(waypoints: FloatArray, first: int, work: Codes, steps: IntArray,
     their deltas to `out` (n, COUNT). `work` does not change.
 
     Returns:
-        Number of these steps.
+        The number of steps that were written.
     """
     count = 0
     columns = _CONTROL - _PLANNING

@@ -28,7 +28,10 @@ class RangeDetector(FittedDetector):
 
 @compiled
 def _outside(memory: FloatArray, deltas: Codes, first: int, end: int) -> float:
-    """Return the largest distance of a delta from its range, 0 inside; NaN if a range is NaN."""
+    """Return the largest distance of a delta from its range.
+
+    The distance is 0 inside the range. The result is NaN if a range contains NaN.
+    """
     worst = 0.0
     for place in range(first, end):
         below = memory[1 + place] - deltas[place]

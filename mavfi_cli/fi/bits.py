@@ -19,7 +19,7 @@ Scalar = float | int | bool
 
 
 class Field(Enum):
-    """The attacked part of a value."""
+    """The part of a value whose bits are flipped."""
 
     SIGN = "sign"
     EXPONENT = "exponent"
@@ -45,12 +45,12 @@ class BitType:
 
     @classmethod
     def raw(cls, size_bytes: int) -> BitType:
-        """Return the type of a register or memory operand of `size_bytes` bytes, without fields."""
+        """Return the type of a register or memory operand, whose only field is ANY."""
         width = 8 * size_bytes
         return cls(name=f"raw{width}", width=width, fields={Field.ANY: range(width)})
 
     def field_bits(self, field: Field) -> range:
-        """Return the bits of `field`.
+        """Return the positions of the bits in `field`.
 
         Raises:
             FaultSpecError: the type has no such field.
@@ -64,7 +64,7 @@ class BitType:
         return FaultSpecError(f"{self.name} has no field {field!r}; it has: {', '.join(known)}")
 
     def mask(self, bits: Iterable[int]) -> int:
-        """Return the xor mask of distinct bits.
+        """Return an integer with the given bits set, which inverts them by exclusive or.
 
         Raises:
             FaultSpecError: the type does not have one of the bits.
@@ -95,12 +95,15 @@ class BitType:
         return tuple(sorted(candidates[int(index)] for index in chosen))
 
     def pattern(self, value: Scalar) -> int:
-        """Return the pattern of a value; a float32 is first rounded to the nearest binary32."""
+        """Return the bit pattern of a value, as an unsigned integer.
+
+        A value of type float32 is first rounded to the nearest binary32 number.
+        """
         of_value, of_pattern = _FORMATS[self.name]
         return int(struct.unpack(of_pattern, struct.pack(of_value, value))[0])
 
     def value(self, pattern: int) -> Scalar:
-        """Return the value of a pattern.
+        """Return the value that a bit pattern represents.
 
         A signalling float32 NaN may become quiet, because Python holds every float as binary64.
         """
@@ -109,7 +112,7 @@ class BitType:
         return value
 
     def flip(self, value: Scalar, bits: Iterable[int]) -> Scalar:
-        """Return the value with `bits` of its pattern inverted."""
+        """Return the value whose bit pattern is that of `value` with `bits` inverted."""
         return self.value(self.pattern(value) ^ self.mask(bits))
 
 
@@ -145,7 +148,7 @@ def bits_of(mask: int) -> tuple[int, ...]:
 
 
 def flip_bytes(data: bytes, bits: Iterable[int]) -> bytes:
-    """Return little-endian bytes with `bits` inverted. Bit 8 is bit 0 of the second byte."""
+    """Return a copy of `data` with `bits` inverted, where bit 8 is bit 0 of the second byte."""
     pattern = int.from_bytes(data, "little") ^ BitType.raw(len(data)).mask(bits)
     return pattern.to_bytes(len(data), "little")
 
@@ -156,6 +159,6 @@ NUMPY_TYPES = {kind.name: kind for kind in (
 
 
 def format_distinct(*values: object) -> list[str]:
-    """Format values with six significant digits, or with all digits if any would look equal."""
+    """Format values with six significant digits, or all digits if two values would look equal."""
     short = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in values]
     return short if len(set(short)) == len(short) else [repr(value) for value in values]

@@ -65,7 +65,11 @@ class Persistence(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trigger:
-    """When a fault strikes. PHASE uses `phase`; RANDOM and FORESEEN use neither field."""
+    """When a fault strikes.
+
+    A trigger PHASE uses the field `phase`; RANDOM and FORESEEN use no further field; all other
+    triggers use `number`.
+    """
 
     when: When = When.RANDOM
     number: float = 0.0  # seconds, ticks, or the invocation's number (from 1)
@@ -85,7 +89,7 @@ class Trigger:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Corruption:
-    """The change to an attacked value, and its duration.
+    """The change that a fault makes to a value, a message or a process, and how long it lasts.
 
     Attributes:
         bits: number of distinct bits of `field` that are flipped.
@@ -119,7 +123,11 @@ class Corruption:
             )
 
     def require(self, name: str, kind: BitType, bits: Sequence[int] | None) -> None:
-        """Refuse a corruption that cannot be applied to values of a type.
+        """Raise an error if the corruption cannot be applied to values of type `kind`.
+
+        Args:
+            name: name of the attacked value in the error message.
+            bits: the exact bits to flip; None if they are drawn.
 
         Raises:
             FaultSpecError: the type lacks an exact bit or the field, the field has too few bits, or
@@ -136,7 +144,15 @@ class Corruption:
 
 
 def require_effect(name: str, effect: Effect, known: Sequence[Effect]) -> None:
-    """Refuse an effect that a target does not support. Raises FaultSpecError."""
+    """Raise an error if a target does not support an effect.
+
+    Args:
+        name: name of the target in the error message.
+        known: the effects that the target supports.
+
+    Raises:
+        FaultSpecError: `effect` is not among `known`.
+    """
     if effect not in known:
         values = ", ".join(own.value for own in known)
         raise FaultSpecError(f"{name}: effect must be one of {values}, got {effect.value}")
@@ -144,12 +160,12 @@ def require_effect(name: str, effect: Effect, known: Sequence[Effect]) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceFault:
-    """One source-level fault.
+    """One source-level fault: the states that it strikes, when it strikes, and how it changes them.
 
     Attributes:
         states: the attacked states, all of the same message. Several states are struck at once,
             each with its own bits.
-        bits: the exact bits of each state, as in a replay; None draws them.
+        bits: the exact bits to flip in each state, as in a replay; None draws them.
     """
 
     states: tuple[State, ...]
@@ -173,19 +189,19 @@ def draw_fault(
     known: Mapping[str, State] = BY_NAME,
     wholes: Mapping[str, tuple[State, ...]] = STAGES,
 ) -> SourceFault:
-    """Draw the fault that a target and a seed determine.
+    """Return a source-level fault in a target. If several states qualify, `seed` draws one.
 
     Args:
         target: a stage, a state, or a group of states. From a stage, one state that has the
             corruption's field is drawn; from a group, one state is drawn unless `together` is set.
         together: strike all states of the target's group at once, as the paper's Table III does
             with the three components of the acceleration.
-        bits: exact bits, the same for all states; None draws them at the strike.
-        known: all states by name.
-        wholes: states of each stage, or of each message.
+        bits: exact bits to flip, the same for all states; None draws them at the strike.
+        known: all states, keyed by name.
+        wholes: states of each stage or message, keyed by its name.
 
     Raises:
-        UnknownName: no such stage, state or group.
+        UnknownName: no stage, state or group is named `target`.
         FaultSpecError: a bit is outside the width, or the type lacks the field.
     """
     rng = Stream.FAULT.generator(seed, "site")
@@ -236,7 +252,7 @@ def inject(
     seed: int = 1,
     exact_bits: Sequence[int] | None = None,
 ) -> Value:
-    """Return the value with flipped bits, or a copy of the array with one corrupted element.
+    """Flip bits of a value, or of one element of an array, and return the corrupted copy.
 
     The same arguments give the same flip. Injecting into the result with the same seed and the same
     bits restores the value.
@@ -262,7 +278,7 @@ def inject(
             f"cannot flip bits of {corrupted.dtype.name}; the supported types are {known}"
         )
     if corrupted.size == 0:
-        raise FaultSpecError("cannot flip bits of an array without elements")
+        raise FaultSpecError("cannot flip bits of an empty array")
     rng = Stream.FAULT.generator(seed, "value")
     element = int(rng.integers(corrupted.size))
     chosen = exact_bits

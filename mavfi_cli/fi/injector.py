@@ -69,7 +69,7 @@ class Pattern:
         self._target = 0
 
     def corrupt(self, pattern: int, kind: BitType) -> int:
-        """Return `pattern` with the corruption applied."""
+        """Return the bit pattern of a value of type `kind` with the corruption applied."""
         if self._bits is None:
             self._bits = self._choose(pattern, kind)
         mask = kind.mask(self._bits)
@@ -108,14 +108,17 @@ class NoInjector:
         self.follower = Follower()
 
     def watch(self, moment: Moment) -> None:
-        """Check the trigger at this moment. Called once per control tick and for every report."""
+        """Check whether the trigger has occurred. Called once per control tick and per report."""
 
     def pass_on(self, message: M, moment: Moment) -> M:
         """Return a published message, corrupted if the fault strikes it."""
         return message
 
     def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """Return the active plan, corrupted if it is struck; `index` is its current waypoint."""
+        """Return the active plan, corrupted if the fault strikes it.
+
+        `index` is the plan's current waypoint.
+        """
         return trajectory
 
     def strike(self, moment: Moment) -> None:
@@ -153,7 +156,7 @@ class Injector(NoInjector):
         self.count = 0
 
     def watch(self, moment: Moment) -> None:
-        """Check the trigger at this moment, even if there is nothing to strike.
+        """Check whether the trigger has occurred, even at a moment with nothing to strike.
 
         Otherwise, a phase that ends before the next message with the attacked state is missed.
         """
@@ -172,7 +175,7 @@ class Injector(NoInjector):
         return f"no {self._awaits} came after {since}" if self._triggered else never
 
     def _due(self, moment: Moment, invocations: int = 0) -> bool:
-        """Return True if the fault strikes now. `invocations` counts the outputs so far."""
+        """Return True if the fault strikes now. `invocations` is the number of outputs so far."""
         self.watch(moment)
         corruption = self._corruption
         if self._begun_s is None:
@@ -189,7 +192,7 @@ class Injector(NoInjector):
         return True
 
     def _is_triggered(self, moment: Moment) -> bool:
-        """Return True if the trigger has occurred; `_due` checks invocations."""
+        """Return True if the trigger has occurred. Only `_due` checks a trigger by invocation."""
         trigger = self._trigger
         return {
             When.TIME: moment.flight_s >= trigger.number - 1e-9,
@@ -237,7 +240,7 @@ class SourceInjector(Injector):
         self._struck: Message | None = None
 
     def pass_on(self, message: M, moment: Moment) -> M:
-        """See `NoInjector.pass_on`."""
+        """Return a published message, corrupted if the fault strikes it."""
         if type(message) is not self._kind:
             return message
         self._invocations += 1
@@ -248,7 +251,7 @@ class SourceInjector(Injector):
         return self._strike(message, moment, 0)
 
     def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """See `NoInjector.strike_latched`."""
+        """Return the active plan, corrupted if the fault strikes it in this tick."""
         if self._kind is not Trajectory or not self._strikes_latched():
             return trajectory
         if trajectory is self._struck and self.fault.corruption.persistence is not (
@@ -262,7 +265,10 @@ class SourceInjector(Injector):
         return struck
 
     def _strikes_latched(self) -> bool:
-        """Return True unless the trigger is an invocation, which is checked on publication."""
+        """Return True if the fault may strike an active plan, not only a newly published one.
+
+        A trigger by invocation is checked only when a plan is published.
+        """
         return self.fault.trigger.when is not When.INVOCATION
 
     def _strike(self, message: M, moment: Moment, first: int) -> M:
@@ -290,7 +296,7 @@ class SourceInjector(Injector):
 
 
 def change_of(name: str, index: int, before: Scalar, kind: BitType, corruption: Pattern) -> Change:
-    """Return the change that a strike makes to one value."""
+    """Return the change that `corruption` makes to the value `before`, as a strike records it."""
     pattern = kind.pattern(before)
     corrupted = corruption.corrupt(pattern, kind)
     return Change(
@@ -337,18 +343,19 @@ Memory = Mapping[str, NDArray[Any]]
 
 
 class MemoryInjector(Injector):
-    """Injects one fault into one element of an array in memory during one mission.
+    """Injects one fault into one element of an array in a detector's memory, during one mission.
 
-    The memory is that of a detector: its thresholds, means and weights.
+    The memory consists of the detector's thresholds, means and weights.
 
     Args:
-        array: the attacked array; None draws one with probability proportional to its size in
-            bytes.
+        memory: the arrays, keyed by name.
+        array: name of the attacked array; None draws one with probability proportional to its size
+            in bytes.
         trigger: when to strike; an invocation is a control tick.
         shortest_flight_s, listener: as for `Injector`.
 
     Attributes:
-        array, element: the attacked array, and the index of the element in C order.
+        array, element: name of the attacked array, and index of the element in C order.
 
     Raises:
         UnknownName: no array has this name.
@@ -371,7 +378,7 @@ class MemoryInjector(Injector):
         listener: Listener,
     ) -> None:
         if array is not None and array not in memory:
-            raise UnknownName("part of the detector's memory", array, memory)
+            raise UnknownName("array in the detector's memory", array, memory)
         rng = Stream.FAULT.generator(seed, "memory")
         super().__init__(rng, trigger, corruption, shortest_flight_s, listener)
         names = sorted(memory)
@@ -379,7 +386,7 @@ class MemoryInjector(Injector):
             sizes = np.array([memory[name].nbytes for name in names], dtype=np.float64)
             array = names[int(rng.choice(len(names), p=sizes / sizes.sum()))]
         if memory[array].size == 0:
-            raise FaultSpecError(f"{array} has no elements")
+            raise FaultSpecError(f"{array} has no elements, so a fault cannot strike it")
         self.array = array
         self.element = int(rng.integers(memory[array].size))
         self._kind = NUMPY_TYPES[memory[array].dtype.name]
@@ -389,7 +396,7 @@ class MemoryInjector(Injector):
         self._pattern = Pattern(corruption, rng, chosen)
 
     def strike(self, moment: Moment) -> None:
-        """See `NoInjector.strike`."""
+        """Record the strike and corrupt the array element, if the fault is due."""
         if not self._due(moment, moment.tick):
             return
         place = self._memory[self.array]
@@ -400,7 +407,7 @@ class MemoryInjector(Injector):
 
 
 class Activation(Enum):
-    """The fate of the corrupted values, over all strikes of a fault."""
+    """What happened to the corrupted values, over all strikes of a fault."""
 
     READ = "read"  # a receiver worked with a corrupted value
     WITHHELD = "withheld"  # the detector's gate withheld it from its receivers
@@ -430,7 +437,7 @@ class Follower:
         return self._message is not None
 
     def struck(self, message: Message, strike: Strike) -> None:
-        """Record a strike; `message` is the message after it."""
+        """Record a strike, and follow `message`, the struck message, if the strike changed it."""
         if self.activation is Activation.READ:
             return
         corrupted = {c.state: c.index for c in strike.changes if c.bits}
@@ -448,7 +455,10 @@ class Follower:
         states: Collection[str],
         index: int | None = None,
     ) -> None:
-        """Record that a receiver reads `states` of a message, at waypoint `index` or at all."""
+        """Record that the receiver `by` reads `states` of a message.
+
+        `index` is the waypoint at which it reads them; None means all waypoints.
+        """
         if self._message is None or message is not self._message:
             return
         for state, at in self._corrupted.items():
@@ -463,7 +473,7 @@ class Follower:
             self.activation, self._message = Activation.WITHHELD, None
 
     def settle(self, held: Callable[[Message], bool]) -> None:
-        """Record the struck message as overwritten unless it is still `held`."""
+        """Record the struck message as overwritten, unless `held` returns True for it."""
         if self._message is not None and not held(self._message):
             self._message = None
             self._become(Activation.OVERWRITTEN)

@@ -49,7 +49,9 @@ def key_from_passphrase(passphrase: str) -> bytes:
 
 
 class Signing:
-    """Signs sent frames and checks received ones, with the newest timestamp of each stream.
+    """Signs the frames that one end of a link sends, and verifies those that it receives.
+
+    The newest timestamp of each stream is stored, so that replayed frames are rejected.
 
     Args:
         key: 32 secret bytes, see `key_from_passphrase`.
@@ -63,7 +65,10 @@ class Signing:
         self._streams: dict[tuple[int, int, int], int] = {}
 
     def sign(self, frame: bytes) -> bytes:
-        """Return the 13-byte signature block of a frame (header to CRC, signed flag set)."""
+        """Return the 13-byte signature block of a frame.
+
+        `frame` must contain all bytes from the marker to the CRC, with the signed flag set.
+        """
         timestamp = max(self._now(), self._next_timestamp) % _TIMESTAMP_END
         self._next_timestamp = timestamp + 1
         block = bytes([_LINK_ID]) + timestamp.to_bytes(6, "little")
@@ -72,8 +77,8 @@ class Signing:
     def accept(self, frame: bytes, header: int, message_id: int, *, signed: bool) -> bool:
         """Return True if a frame is authentic and not a replay, or is an unsigned RADIO_STATUS.
 
-        Only authentic frames update the timestamps, so a sender without the key cannot block a
-        stream.
+        `header` is the length of the frame's header in bytes. Only authentic frames update the
+        timestamps, so a sender without the key cannot block a stream.
         """
         if not signed:
             return message_id == _RADIO_STATUS
@@ -144,7 +149,7 @@ _CRC_TABLE = frozenset(_crc(bytes([x]), 0) for x in range(256))
 
 
 class _Kind:
-    """One message class and its wire layout.
+    """The wire layout of one message class, which packs and unpacks its payloads.
 
     An array of bytes is packed and unpacked in one piece, which is faster than byte by byte.
     """
@@ -183,7 +188,7 @@ class _Kind:
         return self.pack(*values).rstrip(b"\0") or b"\0"
 
     def values(self, frame: bytes, start: int, length: int) -> Sequence[Any]:
-        """Return a payload's values in wire order: arrays as lists, texts without padding."""
+        """Return a payload's field values in wire order: arrays as lists, texts without padding."""
         size = self.size
         if length != size:  # senders cut trailing zeros, and newer ones add fields
             frame, start = frame[start : start + length].ljust(size, b"\0"), 0
@@ -265,7 +270,7 @@ class Codec:
         """
         kind = _KINDS.get(type(message).id) or _kind(type(message).id)
         if kind is None:
-            raise ValueError(f"{type(message).__name__} is not a message of the dialect")
+            raise ValueError(f"{type(message).__name__} is not a message of the `common` dialect")
         payload = kind.payload(message)
         flags = 0 if self._signing is None else _SIGNED
         head = _V2_HEAD.pack(
@@ -306,7 +311,10 @@ class Codec:
         return messages
 
     def _take(self, buffer: bytes, start: int, end: int, messages: list[Message]) -> bool:
-        """Append the message of a candidate frame. Return False if the frame is not valid.
+        """Append the message of the candidate frame `buffer[start:end]` to `messages`.
+
+        Return False if the frame is not valid. A valid frame may have no message: its id may be
+        unknown, or its signature may be rejected.
 
         The checksum includes a byte that depends on the message definition. If the dialect lacks
         the id, any value of that byte is accepted, so one in 256 frames of noise passes. Such a
@@ -364,7 +372,7 @@ def renewed(message: Message, signing: Signing | None = None) -> Message | None:
     the dialect lacks are lost.
 
     Returns:
-        The message, or None if its frame is signed and there is no key.
+        The message with its new frame, or None if its frame is signed and `signing` is None.
     """
     old, kind = frame_of(message), _kind(type(message).id)
     assert kind is not None
@@ -388,7 +396,11 @@ def begins_with_frame(data: bytes) -> bool:
 
 
 def frame_length(buffer: bytes, position: int, end: int) -> int:
-    """Return a frame's length, _INCOMPLETE if it is cut off, or 0 if none can start here."""
+    """Return the length in bytes of the frame that starts at `position`.
+
+    The result is _INCOMPLETE if the frame continues beyond `end`, and 0 if no frame can start at
+    `position`.
+    """
     if end - position < 3:
         return _INCOMPLETE
     length = buffer[position + 1] + 8
@@ -407,9 +419,9 @@ _TYPES = {"B": "uint8_t", "H": "uint16_t", "I": "uint32_t", "s": "char"}
 
 
 def _message_class(number: int, name: str, crc_extra: int, **layout: str) -> Any:
-    """Return a message class that the codec treats as one of the dialect's.
+    """Return a message class that the codec treats like those of the dialect.
 
-    The layout maps each field to its `struct` code.
+    `layout` maps each field's name to its `struct` code, in wire order.
     """
     names = list(layout)
     types = [_TYPES[code[-1]] for code in layout.values()]
@@ -451,14 +463,17 @@ AvailableModes = _message_class(
 ADDED: dict[int, Any] = {
     message.id: message for message in (ProtocolVersion, ComponentMetadata, AvailableModes)
 }
-"""The added message classes by id."""
+"""The message classes that this module adds to the dialect, keyed by message id."""
 
 SLOW_STREAMS_US = {
     dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 2e5,
     dialect.MAVLINK_MSG_ID_SYS_STATUS: 5e5,
     dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 5e5,
 }
-"""Interval of each stream that a flight needs besides the vehicle state, us, by message id."""
+"""Intervals, in microseconds, of the streams that a flight needs besides the vehicle state.
+
+The keys are message ids.
+"""
 STATE_STREAMS = (
     dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
 )  # fmt: skip
@@ -467,7 +482,7 @@ CHUNK_LENGTH = 50  # characters per STATUSTEXT
 
 
 def text_messages(severity: int, data: bytes, text_id: int) -> Iterator[Message]:
-    """Yield the STATUSTEXT messages of an ASCII text.
+    """Yield the STATUSTEXT messages that carry the ASCII text `data`.
 
     A text that fits into one message gets id 0. A longer one is split into chunks that share
     `text_id`. The last chunk is shorter than CHUNK_LENGTH, and may be empty.

@@ -40,7 +40,7 @@ _MOST_TEXTS = 5  # maximum number of the autopilot's texts that an error quotes
 
 @dataclass(slots=True, kw_only=True)
 class Ticket:
-    """A submitted command."""
+    """A submitted command, with its progress and its result."""
 
     command: int
     component: int
@@ -59,7 +59,7 @@ class Ticket:
 
 
 class Commands:
-    """Commands of a session to the components of one system.
+    """The commands that a session sends to the components of one MAVLink system.
 
     Several submitted commands may be pending at once. In addition, each phase of the session makes
     one request at a time, which is repeated until telemetry shows its effect. Set `now_s`, the
@@ -84,10 +84,11 @@ class Commands:
         unused: float = 0.0,
         refusals: int = 0,
     ) -> Ticket:
-        """Queue a COMMAND_LONG with the given parameters; the remaining ones are set to `unused`.
+        """Queue a COMMAND_LONG with the given parameters, and return its ticket.
 
-        After a temporary refusal the command is repeated 1 s later, at most `refusals` times. If
-        too many commands of this kind are queued, it is given up at once.
+        The remaining parameters are set to `unused`. After a temporary refusal the command is
+        repeated 1 s later, at most `refusals` times. If too many equal commands to this component
+        are queued, the new one is given up at once.
         """
         padded = (*parameters, *[unused] * (7 - len(parameters)))
         ticket = Ticket(
@@ -123,7 +124,7 @@ class Commands:
             lane.popleft().accepted = False
 
     def poll(self, system: int) -> list[Message]:
-        """Return the commands that are due now, addressed to `system`."""
+        """Return the COMMAND_LONG messages that are due now, addressed to `system`."""
         due = []
         for lane in filter(None, self._lanes.values()):
             while lane and lane[0].due_s <= self.now_s:
@@ -163,10 +164,10 @@ class Commands:
         raise CommandRefused(f"autopilot refused {command}: {result}{quoted}")
 
     def insist(self, name: str, command: int, *parameters: float, unused: float = 0.0) -> bool:
-        """Send a command until it is accepted. Return True once it is.
+        """Send a command until the autopilot accepts it. Return True once it has accepted it.
 
-        If the phase continues for 3 s after that, the command is sent again. Raises CommandRefused
-        if it was refused permanently or not answered.
+        If the phase continues for 3 s after that, the command is sent again. Raises CommandRefused,
+        with `name` for the command, if the autopilot refused it permanently or did not answer.
         """
         if self._ticket is None:
             self._ticket = self.submit(command, *parameters, unused=unused, refusals=2)
@@ -186,9 +187,10 @@ class Commands:
         return False
 
     def request_mode(self, mode: str) -> bool:
-        """Request a mode; return True once a HEARTBEAT shows it, whatever was acknowledged.
+        """Request a flight mode. Return True once a HEARTBEAT shows that mode.
 
-        Raises CommandRefused if the mode has not changed after the maximum number of requests.
+        Acknowledgements do not count. Raises CommandRefused if the mode has not changed after the
+        maximum number of requests.
         """
         if self._telemetry.mode == mode:
             return True
@@ -227,7 +229,10 @@ class Commands:
         self._requested[message_id] = ticket, self.now_s + interval_s
 
     def request_streams(self, state_rate_hz: float) -> None:
-        """Request a flight's streams: the state at `state_rate_hz`, the others at fixed rates."""
+        """Request the message streams that a flight needs.
+
+        The vehicle state is requested at `state_rate_hz`, the other streams at fixed rates.
+        """
         state = dict.fromkeys(STATE_STREAMS, 1e6 / state_rate_hz)
         for message_id, interval_us in {**state, **SLOW_STREAMS_US}.items():
             self.submit(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)

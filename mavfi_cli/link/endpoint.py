@@ -33,7 +33,7 @@ _HOST_PORT = re.compile(r"(?:(?P<host>\[[^\]]*\]|[^:\[\]]*):)?(?P<port>[0-9]+)",
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Endpoint:
-    """A parsed endpoint URL. Fields that its scheme does not use have no meaning."""
+    """A parsed endpoint URL. Fields that its scheme does not use keep their defaults."""
 
     url: str
     scheme: str  # the word before the first colon, one of the known schemes
@@ -44,10 +44,12 @@ class Endpoint:
     fd: int = -1
 
     def open_socket(self, *, beyond: bool) -> socket.socket:
-        """Open a bound or connected socket for a network URL. Raises as `open_transport` does.
+        """Open a socket for a network URL, bound if the scheme listens and otherwise connected.
+
+        Raises LinkError as `open_transport` does.
 
         Args:
-            beyond: Allow addresses other than loopback.
+            beyond: Allow addresses beyond loopback.
         """
         datagram = self.scheme.startswith("udp")
         kind = socket.SOCK_DGRAM if datagram else socket.SOCK_STREAM
@@ -114,7 +116,7 @@ class Endpoint:
 
 
 class _UrlError(LinkError):
-    """A URL that is not valid, which is a usage error."""
+    """The URL is not valid, which is a usage error."""
 
     exit_code = 2
 
@@ -164,7 +166,10 @@ TWO_AUTOPILOTS = "two autopilots send here"
 
 
 class SenderSlot(Generic[Sender]):
-    """The slot for an endpoint's one sender. After 5 s of silence another sender may take it."""
+    """Selects the one sender to which an endpoint listens.
+
+    After 5 s of silence another sender may take its place.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -177,7 +182,7 @@ class SenderSlot(Generic[Sender]):
 
     @property
     def is_free(self) -> bool:
-        """True if there is no holder, or if it has been silent for too long."""
+        """True if no sender holds the slot, or if the holder has been silent for too long."""
         return self.holder is None or self._clock() >= self._silent_from_s
 
     def take(self, sender: Sender) -> None:
@@ -191,7 +196,7 @@ class SenderSlot(Generic[Sender]):
             self.holder = None
 
     def refresh(self, sender: Sender) -> bool:
-        """Record that a sender has sent. Return True if it holds the slot."""
+        """Record that a sender has sent data. Return True if that sender holds the slot."""
         if sender != self.holder:
             return False
         if self._challenger is not None:
@@ -200,5 +205,5 @@ class SenderSlot(Generic[Sender]):
         return True
 
     def challenge(self, sender: Sender) -> None:
-        """Record that another sender has sent while the slot is taken."""
+        """Record that another sender has sent data while the slot is taken."""
         self._challenger = sender

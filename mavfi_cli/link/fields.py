@@ -25,18 +25,21 @@ _IGNORED = {
 
 
 class _WireState(State):
-    """A field of a message, or one element of an array in it."""
+    """A numeric field of a MAVLink message, or one element of an array field."""
 
     __slots__ = ()
 
     def read(self, message: Message, index: int) -> Scalar:
-        """Return the value in a received message."""
+        """Return the field's value in a received message. `index` is ignored."""
         value: Any = getattr(message, self.source)
         number: Scalar = value if self.column is None else value[self.column]
         return number
 
     def write(self, message: Message, index: int, value: Scalar) -> Message:
-        """Return a copy of a received message with a new value of this field, but the old frame."""
+        """Return a copy of a received message in which this field has the given value.
+
+        The copy still has the old frame. `index` is ignored.
+        """
         changed, field = copy.copy(message), getattr(message, self.source)
         if self.column is not None:
             field = [*field[: self.column], value, *field[self.column + 1 :]]
@@ -46,7 +49,7 @@ class _WireState(State):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WireFields:
-    """A MAVLink message, and its numeric fields as states by name."""
+    """The numeric fields of one MAVLink message type, as states keyed by name."""
 
     name: str
     number: int  # message id
@@ -54,7 +57,7 @@ class WireFields:
 
     @classmethod
     def of(cls, name: str) -> WireFields:
-        """Return the fields of a message.
+        """Return the numeric fields of the message type `name`.
 
         Raises:
             UnknownName: The dialect has no such message. The message suggests the nearest.
@@ -83,6 +86,6 @@ class WireFields:
 
 
 def is_ignored(message: Message, state: State) -> bool:
-    """Return True if a message is a setpoint whose mask tells the autopilot to ignore a field."""
+    """Return True if a message is a setpoint whose mask tells the autopilot to ignore `state`."""
     mask = getattr(message, "type_mask", 0) if message.get_type() in _SETPOINTS else 0
     return bool(mask & _IGNORED.get(state.source, 0))

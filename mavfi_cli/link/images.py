@@ -44,7 +44,7 @@ _CHECKSUM = re.compile(r"depth8:crc32=([0-9a-fA-F]{8})")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageFrame:
-    """A complete image from the camera."""
+    """A complete depth image from the camera."""
 
     stamp_s: float  # time of capture on the vehicle's boot clock
     index: int
@@ -93,7 +93,7 @@ _Packet = tuple[int, bytes]  # count of messages at its arrival, data
 
 
 class ImageReceiver:
-    """Assembles frames from messages.
+    """Assembles depth frames from the camera's MAVLink messages.
 
     A lost packet costs only its own frame. A frame whose checksum never matches is dropped. For any
     input, memory is bounded by a few frames of MAX_PIXELS.
@@ -123,7 +123,10 @@ class ImageReceiver:
 
     @property
     def lost(self) -> int:
-        """Number of frames that can no longer be completed, with those that the index skipped."""
+        """Number of frames that can no longer be completed.
+
+        It includes the frames whose index was skipped.
+        """
         if self._first is None:
             return self._lost_before
         counted = self._newest - self._first + 1
@@ -131,7 +134,10 @@ class ImageReceiver:
         return self._lost_before + counted - whole - len(self._open)
 
     def feed(self, message: Message) -> list[ImageFrame]:
-        """Handle one of IMAGE_MESSAGES. Return the frames that it completes, usually none."""
+        """Handle a message whose id is in IMAGE_MESSAGES, and return the frames that it completes.
+
+        Most messages complete no frame.
+        """
         return _HANDLERS[type(message).id](self, message)
 
     def _field_of_view(self, message: Message) -> list[ImageFrame]:
@@ -143,7 +149,10 @@ class ImageReceiver:
         return []
 
     def _captured(self, message: Message) -> list[ImageFrame]:
-        """Open a frame. Packets that arrived shortly before may belong to it."""
+        """Handle CAMERA_IMAGE_CAPTURED, which announces a frame.
+
+        Packets that arrived shortly before may belong to the frame.
+        """
         self._count += 1
         stamp_s = message.time_boot_ms / 1e3
         if not self._follow(message.image_index, stamp_s):
@@ -157,7 +166,7 @@ class ImageReceiver:
         return self._finish()
 
     def _follow(self, index: int, stamp_s: float) -> bool:
-        """Track the index. Return False for a frame that is known or too old.
+        """Track the index of announced frames. Return False if this frame is known or too old.
 
         The camera has restarted if the index is lower and the stamp newer than before, or if the
         index has jumped by more than _LARGEST_GAP.
@@ -204,7 +213,7 @@ class ImageReceiver:
         return self._finish() if len(self._packets) >= self._places else []
 
     def _finish(self) -> list[ImageFrame]:
-        """Close and return the open frames that are complete."""
+        """Return the open frames that have become complete, and close them."""
         done = []
         for frame in list(self._open):
             shape = self._shape
@@ -225,9 +234,10 @@ class ImageReceiver:
         return done
 
     def _solve(self, frame: _Announced, shape: _Shape) -> bytes | None:
-        """Return the nearest or newest packets' pixels if they match the checksum, else None.
+        """Return a frame's pixels if its nearest or its newest packets match its checksum.
 
-        Without a checksum, packets match if they arrived close to each other.
+        Return None if neither do. Without a checksum, packets match if they arrived close to each
+        other.
         """
         newest = [self._packets[place][-1] for place in range(shape.packets)]
         nearby = [
@@ -281,7 +291,7 @@ IMAGE_MESSAGES = frozenset(_HANDLERS)  # ids of the messages that a receiver han
 
 
 def _shape_of(message: Message) -> _Shape | None:
-    """Return the announced size, or None if it is inconsistent or too large."""
+    """Return the image size in a handshake, or None if it is inconsistent or too large."""
     columns, rows, payload = message.width, message.height, message.payload
     if message.type != dialect.MAVLINK_DATA_STREAM_IMG_RAW8U or not 1 <= payload <= 253:
         return None

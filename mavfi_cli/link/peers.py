@@ -30,10 +30,10 @@ class Peer(ABC):
     """The program at the other end of a transport. `Peers` sets the attributes.
 
     Attributes:
-        scheme: Scheme of its endpoint's URL.
+        scheme: Scheme of the URL of the endpoint to which the peer belongs.
         last_received_s, last_sent_s: Times of the newest valid frame from it and of the newest
             message to it.
-        full_rate_s: How long it gets all messages after a valid frame, s.
+        full_rate_s: Time after a valid frame for which a UDP peer gets all messages, s.
     """
 
     scheme = ""
@@ -48,7 +48,10 @@ class Peer(ABC):
         """Handle received bytes. Return the valid messages among them."""
 
     def forward(self, *, frame: bytes, sender: Peer) -> bool:
-        """Send the frame of another peer to this one, unchanged. Return False if it is its own."""
+        """Send the frame of another peer to this peer, unchanged.
+
+        Return False, without sending, if this peer is the `sender`.
+        """
         if sender is self:
             return False
         self.transport.send(frame)
@@ -64,7 +67,7 @@ T = TypeVar("T")
 
 
 class Peers(Generic[P]):
-    """All peers of all open endpoints.
+    """The peers of all open endpoints, which are served in turn.
 
     Args:
         signing: Verifies the first frame of a sender; None accepts any valid frame.
@@ -89,10 +92,11 @@ class Peers(Generic[P]):
         return iter(list(self._peers))
 
     def open(self, endpoint: str | Transport, make: Callable[[Transport], P]) -> Listener:
-        """Open an endpoint. `make` turns its transports into peers. An error closes all endpoints.
+        """Open an endpoint, and return its listener. An error closes all endpoints.
 
         Args:
             endpoint: URL, or an open transport.
+            make: Makes a peer from each transport of the endpoint.
 
         Raises LinkError if it cannot be opened.
         """
@@ -110,7 +114,7 @@ class Peers(Generic[P]):
         return listener
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until bytes or a connection arrive, at most `timeout_s`."""
+        """Wait at most `timeout_s` seconds until bytes or a new connection arrive."""
         poller = select.poll()
         descriptors = {listener.fileno() for _, listener, _ in self._endpoints}
         for descriptor in descriptors | {peer.transport.fileno() for peer in self._peers}:
@@ -119,9 +123,10 @@ class Peers(Generic[P]):
         poller.poll(timeout_s * 1e3)
 
     def serve(self, until_s: float) -> None:
-        """Accept peers, then receive from all in turn until none has data, or the deadline.
+        """Accept new peers, then receive from all peers in turn.
 
-        Then remove silent peers on UDP ports.
+        Receiving ends when no peer has data, or at the time `until_s` of the clock. Then silent
+        peers on UDP ports are removed.
         """
         self._accept()
         idle = 0
@@ -134,15 +139,16 @@ class Peers(Generic[P]):
                 self._remove(peer)
 
     def for_all(self, action: Callable[[P], object]) -> None:
-        """Call a function with every peer, and remove those whose connection is lost."""
+        """Call `action` with every peer, and remove the peers whose connection is lost."""
         for peer in self:
             self._call(action, peer)
 
     def send_in_turn(self, action: Callable[[P], object], until_s: float = math.inf) -> None:
-        """Call a sending function for each peer in turn, but less often for a silent UDP peer.
+        """Call `action`, which sends to a peer, for each peer in turn.
 
-        For a silent peer, the interval doubles each time. The peers that remain at `until_s` come
-        first in the next call. The function returns False if it had nothing to send.
+        A silent UDP peer is called less and less often: the interval doubles each time. The peers
+        that remain at `until_s` come first in the next call. The action must return False if it had
+        nothing to send.
         """
         for _ in range(len(self._peers)):
             if not self._peers:
@@ -182,7 +188,7 @@ class Peers(Generic[P]):
         return bool(data)
 
     def _call(self, action: Callable[[P], T], peer: P) -> T | None:
-        """Return the function's result for a peer. Remove a disconnected peer and return None."""
+        """Return `action(peer)`. If the peer has disconnected, remove it and return None."""
         try:
             return action(peer)
         except LinkLost as error:
@@ -200,6 +206,9 @@ class Peers(Generic[P]):
 
 
 def _is_due(peer: Peer, now_s: float) -> bool:
-    """Return False if a silent UDP peer was sent a message in the last half of its silence."""
+    """Return True if a peer may be sent a message now.
+
+    A silent UDP peer may not if a message was sent to it in the last half of its silence.
+    """
     silent_s, unsent_s = now_s - peer.last_received_s, now_s - peer.last_sent_s
     return peer.scheme != "udpin" or silent_s <= max(peer.full_rate_s, 2.0 * unsent_s)

@@ -18,14 +18,17 @@ from mavfi_cli.link.transport import Transport
 
 
 class Side(Enum):
-    """The sender of a frame."""
+    """The side of the router from which a frame comes."""
 
     AUTOPILOT = "autopilot"
     COMPANION = "companion"
 
 
 Pass = Callable[[Message, Side], Iterable[bytes]]
-"""Returns the frames to forward in place of a message: its own frame, others, or none."""
+"""A function that decides which frames to forward in place of a received message.
+
+It takes the message and its side, and returns the message's own frame, other frames or none.
+"""
 
 
 class _Program(Peer):
@@ -55,7 +58,7 @@ class Router:
         allow_unsigned: Allow addresses other than loopback without signing.
 
     Attributes:
-        port: Local port of the companion's link if that listens; the system chooses one for port 0.
+        port: Local port of the companion's link if that listens. For port 0 the system chooses one.
 
     Raises:
         LinkError: A link cannot be opened.
@@ -101,7 +104,7 @@ class Router:
             self.send(frame, sender.side, sender)
 
     def send(self, frame: bytes, side: Side, sender: Any = None) -> None:
-        """Send a frame as if it came from `side`, but not back to `sender`."""
+        """Send a frame to every peer that gets the frames of `side`, except to `sender`."""
 
         def forward(peer: _Program) -> None:
             if peer is not sender and not side is peer.side is Side.AUTOPILOT:

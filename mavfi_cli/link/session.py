@@ -42,7 +42,10 @@ _DISARM_AFTER_S = 5.0  # time on the ground after which the session disarms the 
 
 
 def _float32(vector: Sequence[float]) -> Sequence[float]:
-    """Return a vector whose components beyond the range of float32 are infinite; NaN stays NaN."""
+    """Return the vector with each component beyond the range of float32 replaced by infinity.
+
+    NaN stays NaN.
+    """
     if sum(map(abs, vector)) <= _LARGEST_FLOAT32:
         return vector
     return [
@@ -59,7 +62,7 @@ def _heartbeat() -> Message:
 
 
 class Phase(Enum):
-    """Phase of the flight."""
+    """The phase of a flight, from the first contact with the autopilot to the landing."""
 
     CONNECTING = "connecting"
     WAITING_READY = "waiting until ready"
@@ -90,7 +93,7 @@ class SessionSettings:
 
 
 class OffboardSession:
-    """Connects, arms, takes off, streams setpoints and lands.
+    """The MAVLink session of one flight: it connects, arms, takes off, streams setpoints and lands.
 
     Args:
         url: URL of the link, for error messages.
@@ -128,16 +131,19 @@ class OffboardSession:
 
     @property
     def state(self) -> VehicleState | None:
-        """Newest vehicle state in ENU; None before position and attitude are known."""
+        """Newest vehicle state in ENU, or None before position and attitude are known."""
         return self.telemetry.state
 
     @property
     def is_up(self) -> bool:
-        """True if the vehicle is in the air, or has reached the take-off height before."""
+        """True if the vehicle is in the air, or has reached the take-off height at least once."""
         return self._was_up or self.telemetry.in_air
 
     def state_at(self, stamp_s: float) -> VehicleState | None:
-        """Return the state at a stamp, exact or interpolated; None if the history lacks it."""
+        """Return the vehicle state at a stamp, interpolated if needed.
+
+        Return None if the history of states does not include the stamp.
+        """
         return self.telemetry.history.at(stamp_s)
 
     # Requests of the mission --------------------------------------------------------------------
@@ -148,10 +154,11 @@ class OffboardSession:
         yaw_enu_rad: float | None = None,
         acceleration_enu_mps2: Sequence[float] | None = None,
     ) -> None:
-        """Set velocity (3,), yaw and feed-forward acceleration (3,), starting with the next tick.
+        """Set the velocity (3,), yaw and feed-forward acceleration (3,) to send from the next tick.
 
         A value beyond float32 becomes infinity, as in a C++ companion, and NaN stays NaN. The
-        autopilot decides how to handle a corrupted command. Without a yaw the heading is kept.
+        autopilot decides how to handle a corrupted command. Without a yaw, the vehicle keeps its
+        heading.
         """
         mask, yaw, ax, ay, az = _IGNORED, 0.0, 0.0, 0.0, 0.0
         east, north, up = _float32(velocity_enu_mps)
@@ -166,7 +173,7 @@ class OffboardSession:
         self._target = (mask, 0.0, 0.0, 0.0, north, east, -up, ax, ay, -az, yaw, 0.0)
 
     def hold(self) -> None:
-        """Hold position and heading, starting with the next tick."""
+        """Command zero velocity and the current heading, starting with the next tick."""
         self.set_target((0.0, 0.0, 0.0))
 
     def announce(self, text: str) -> None:
@@ -176,7 +183,7 @@ class OffboardSession:
         self._answers += text_messages(dialect.MAV_SEVERITY_WARNING, data, self._texts)
 
     def start_camera(self, interval_s: float) -> None:
-        """Request a frame from the camera every `interval_s`, indefinitely."""
+        """Request a depth frame from the camera every `interval_s` seconds, indefinitely."""
         self._commands.submit(
             dialect.MAV_CMD_IMAGE_START_CAPTURE, 0.0, interval_s, 0.0, 0.0,
             component=CAMERA, unused=math.nan, refusals=3,
@@ -190,7 +197,7 @@ class OffboardSession:
     # Received messages --------------------------------------------------------------------------
 
     def handle(self, message: Message) -> None:
-        """Handle a message from the autopilot or its camera. Other senders are ignored."""
+        """Handle a message from the autopilot or its camera. Ignore other senders."""
         telemetry, number = self.telemetry, type(message).id
         telemetry.handle(message)
         if number not in _HANDLED:
@@ -229,7 +236,10 @@ class OffboardSession:
                 self._request_origin()
 
     def _request_origin(self) -> None:
-        """Request the origin, or CAMERA_INFORMATION if positions are already in the world frame."""
+        """Request the origin from the camera.
+
+        If positions are already in the world frame, request CAMERA_INFORMATION instead.
+        """
         wanted = dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION
         if self._settings.needs_camera:
             wanted = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET
@@ -239,7 +249,7 @@ class OffboardSession:
     # Sent messages ------------------------------------------------------------------------------
 
     def tick(self, stamp_s: float) -> list[Message]:
-        """Advance to a stamp. Return the messages to send; the setpoint of this stamp is the last.
+        """Advance the session to a stamp. Return the messages to send, with the setpoint last.
 
         Every tick has a setpoint, because OFFBOARD requires setpoints before it is entered and a
         lockstep peer waits for them. ArduCopter is the exception: it has no such handshake, and a
@@ -305,7 +315,9 @@ class OffboardSession:
             raise LinkError(f"{self._url}: {self.telemetry.unfit}")
 
     def _position_known(self) -> bool:
-        """Return True once the camera has answered and a state has arrived, or without a camera.
+        """Return True once the camera has answered and a state has arrived.
+
+        Also return True if no camera is needed.
 
         Raises LinkError if the camera or the state does not arrive in time.
         """
@@ -316,7 +328,7 @@ class OffboardSession:
             raise LinkError(
                 f"{self._url}: no camera (MAVLink component 100) answered within "
                 f"{settings.camera_timeout_s:g} s, so the vehicle does not take off; "
-                "--eyes starts one"
+                "to start one, use --eyes"
             )
         self._require_soon()
         if self._elapsed_s() < _LISTEN_S:

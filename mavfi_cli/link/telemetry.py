@@ -79,14 +79,17 @@ _REORDERED_MS = 1000  # a stamp that lags by less is a late packet; otherwise th
 
 
 class _StateHistory:
-    """The newest states in stamp order. At 2 * _KEPT states, the older half is dropped."""
+    """The newest vehicle states in stamp order. At 2 * _KEPT states, the older half is dropped."""
 
     def __init__(self) -> None:
         self._stamps_ms: list[int] = []
         self._states: list[VehicleState] = []
 
     def add(self, state: VehicleState) -> bool:
-        """Append a state; return False if it is late or repeated. A clock restart clears all."""
+        """Append a state and return True, or return False if the state is late or repeated.
+
+        A restart of the autopilot's clock drops all earlier states.
+        """
         stamp_ms = round(state.stamp_s * 1e3)
         if self._stamps_ms and stamp_ms <= self._stamps_ms[-1]:
             if stamp_ms > self._stamps_ms[-1] - _REORDERED_MS:
@@ -101,7 +104,7 @@ class _StateHistory:
         return True
 
     def at(self, stamp_s: float) -> VehicleState | None:
-        """Return the state at a stamp, interpolated if needed; None outside the history."""
+        """Return the state at a stamp, interpolated if needed, or None outside the history."""
         stamp_ms = round(stamp_s * 1e3)
         index = bisect_left(self._stamps_ms, stamp_ms)
         if index == len(self._stamps_ms):
@@ -114,7 +117,10 @@ class _StateHistory:
 
 
 def _between(before: VehicleState, after: VehicleState, stamp_s: float) -> VehicleState:
-    """Interpolate position and velocity linearly, and the quaternion by nlerp (shorter arc)."""
+    """Return the vehicle state at `stamp_s`, interpolated between two states.
+
+    Position and velocity are interpolated linearly, the quaternion by nlerp along the shorter arc.
+    """
     share = (stamp_s - before.stamp_s) / (after.stamp_s - before.stamp_s)
     sign = -1.0 if dot(before.quaternion, after.quaternion) < 0.0 else 1.0
     quaternion = (1.0 - share) * before.quaternion + share * sign * after.quaternion
@@ -145,14 +151,14 @@ _LONGEST = 1000  # characters of a text
 
 
 class _Text(NamedTuple):
-    """A finished text of a component, with _GAP for missing chunks."""
+    """A finished status text of a component, in which _GAP stands for missing chunks."""
 
     severity: int  # MAV_SEVERITY, 0 emergency .. 7 debug
     text: str
 
 
 class _Open(NamedTuple):
-    """An unfinished text: its chunks by number."""
+    """An unfinished status text, with the chunks that have arrived, keyed by number."""
 
     severity: int
     started_s: float
@@ -160,7 +166,10 @@ class _Open(NamedTuple):
 
 
 class _TextCollector:
-    """Keeps the newest 1000 finished texts and the unfinished ones, and counts the finished."""
+    """Assembles status texts from their chunks, and keeps the newest 1000 finished texts.
+
+    `total` counts all finished texts.
+    """
 
     def __init__(self) -> None:
         self.texts: deque[_Text] = deque(maxlen=_MAX_TEXTS)
@@ -168,7 +177,7 @@ class _TextCollector:
         self.open: dict[tuple[int, int, int], _Open] = {}
 
     def since(self, total: int) -> list[_Text]:
-        """Return the kept texts after the first `total`, oldest first."""
+        """Return the kept texts that were finished after the first `total` texts, oldest first."""
         if total == self.total:
             return []
         fresh = min(self.total - total, len(self.texts))
@@ -192,7 +201,10 @@ class _TextCollector:
         return done
 
     def expire(self, stamp_s: float, patience_s: float = _PATIENCE_S) -> list[_Text]:
-        """Finish and return the texts that began at least `patience_s` ago, gaps included."""
+        """Finish the incomplete texts that began at least `patience_s` ago, and return them.
+
+        Their missing chunks are marked as gaps.
+        """
         late = [k for k, o in self.open.items() if stamp_s - o.started_s >= patience_s]
         return [self._finish(key) for key in late]
 
@@ -252,7 +264,7 @@ class Telemetry:
         return self.landed_state in _IN_AIR
 
     def handle(self, message: Message) -> None:
-        """Handle a message from the autopilot; ignore those of other senders."""
+        """Handle a message from the autopilot. Ignore messages from other senders."""
         handler = _HANDLERS.get(type(message).id)
         if handler is None:
             return
@@ -267,7 +279,10 @@ class Telemetry:
         return bool(header.srcComponent == component and header.srcSystem == self.system != 0)
 
     def _adopt(self, message: Message) -> None:
-        """Adopt the first supported autopilot that sends a HEARTBEAT; set `unfit` for another."""
+        """Adopt the sender of a HEARTBEAT if it is the first supported autopilot.
+
+        Set `unfit` if it is a second autopilot, or one that is not supported.
+        """
         system, profile = message.get_srcSystem(), _PROFILES.get(message.autopilot)
         if message.get_srcComponent() != AUTOPILOT or system == self.system:
             return
@@ -339,9 +354,10 @@ class Telemetry:
             self.home_amsl_m = (message.alt - message.relative_alt) / 1e3
 
     def move_origin(self, origin_enu_m: FloatArray) -> None:
-        """Set the origin of the positions, (3,), ENU, m. A change drops all states.
+        """Set the origin (3,) of the autopilot's positions in the world frame (ENU), in metres.
 
-        An origin with a coordinate beyond FARTHEST_M is ignored.
+        A new origin drops all earlier states. An origin with a coordinate beyond FARTHEST_M is
+        ignored.
         """
         if not is_within(FARTHEST_M, origin_enu_m):
             return
@@ -356,7 +372,7 @@ class Telemetry:
         self._look_for_verdict(self.texts.add(message, self.now_s))
 
     def expire(self) -> None:
-        """Finish texts whose missing chunks are overdue."""
+        """Finish the status texts whose missing chunks are overdue."""
         if self.texts.open:
             self._look_for_verdict(self.texts.expire(self.now_s))
 

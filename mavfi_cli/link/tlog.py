@@ -1,7 +1,7 @@
 """Writes and reads the .tlog of a flight: all frames in both directions, as ground stations do.
 
 A record is the time in microseconds since 1970 (8 bytes, big endian) and the unchanged frame.
-Received frames of messages that the `common` dialect lacks are left out.
+Received frames of messages that the `common` dialect lacks are omitted.
 
 In simulation the time is EPOCH_UNIX_S plus the stamp, so the same flight gives the same bytes. For
 a foreign autopilot it is this computer's UTC, as in the logs of ground stations, because the
@@ -29,10 +29,10 @@ _FLUSH_INTERVAL_S = 1.0  # difference of stamps between writes
 
 
 def unix_time_of_stamp_0(path: Path) -> float:
-    """Return the Unix time, s, at which a foreign autopilot's clock was 0, from its tlog.
+    """Return the Unix time, in seconds, at which the clock of the autopilot in a tlog was 0.
 
-    The first state gives it; without a state it is EPOCH_UNIX_S. Raises RecordError if the file
-    cannot be read.
+    The time follows from the first vehicle state in the tlog of a foreign autopilot. Without a
+    state, it is EPOCH_UNIX_S. Raises RecordError if the file cannot be read.
     """
     for unix_s, message in tlog_messages(path):
         if isinstance(message, dialect.MAVLink_local_position_ned_message):
@@ -41,7 +41,9 @@ def unix_time_of_stamp_0(path: Path) -> float:
 
 
 def tlog_messages(path: Path) -> Iterator[tuple[float, Message]]:
-    """Yield the messages of a tlog with their Unix times, s, up to the first damaged record.
+    """Yield the Unix time, in seconds, and the message of each record of a tlog.
+
+    Reading ends at the first damaged record.
 
     Raises:
         RecordError: The file cannot be read.
@@ -56,9 +58,11 @@ def tlog_messages(path: Path) -> Iterator[tuple[float, Message]]:
 
 
 class TlogWriter:
-    """Writes a .tlog. A killed process leaves all but the last second or 64 KiB, in whole records.
+    """Writes a .tlog file, which contains MAVLink frames and their times.
 
-    Records written before `open` are buffered. Every method may raise RecordError.
+    If the process is killed, the file contains only whole records, and at most the last second or
+    64 KiB is missing. Records written before `open` are buffered. Every method may raise
+    RecordError.
 
     Args:
         epoch_unix_s: Unix time of stamp 0.
@@ -73,7 +77,7 @@ class TlogWriter:
         self._descriptor: int | None = None
 
     def open(self, path: Path) -> None:
-        """Create or overwrite the file."""
+        """Open the file for the records. If it exists, it is overwritten."""
         self._path = path
         try:
             self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
@@ -81,7 +85,10 @@ class TlogWriter:
             raise self._error(error) from None
 
     def continue_in(self, path: Path) -> None:
-        """Copy the file to `path` and continue there. For a fork of the process that opened it."""
+        """Copy the file to `path`, and write further records there.
+
+        For a fork of the process that opened the file.
+        """
         try:
             shutil.copyfile(self._path, path)
             if self._descriptor is not None:
@@ -92,7 +99,7 @@ class TlogWriter:
         self._path = path
 
     def write(self, stamp_s: float, *frames: bytes) -> None:
-        """Record frames at a stamp, s. At most 1 s or 64 KiB of records wait to be written."""
+        """Record frames at a stamp. At most 1 s or 64 KiB of records wait to be written."""
         time_us = self._epoch_us + round(stamp_s * 1e6)
         records = time_us.to_bytes(8, "big").join([b"", *frames])
         self._pending.append(records)
@@ -103,7 +110,7 @@ class TlogWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Write pending records to the file. Every record is written whole or not at all."""
+        """Write the pending records to the file. Every record is written whole or not at all."""
         if self._descriptor is None:
             return
         data, written = memoryview(b"".join(self._pending)), 0
@@ -131,14 +138,14 @@ class TlogWriter:
 
 
 class RecordedLink:
-    """One end of a link with a tlog of its traffic.
+    """One end of a link, which records its traffic in a tlog.
 
     Traffic before `recording` is buffered and written first.
 
     Args:
         transport: Open transport. The caller closes it.
         signing: Signs sent frames and rejects received ones without a valid signature.
-        clock: Returns the Unix time, s, to record in place of the stamps.
+        clock: Returns the Unix time, in seconds, to record in place of the stamps.
     """
 
     def __init__(
@@ -157,7 +164,7 @@ class RecordedLink:
 
     @contextlib.contextmanager
     def recording(self, path: Path) -> Iterator[None]:
-        """Write the tlog during the context.
+        """Write the tlog to `path` until the context ends.
 
         Raises RecordError if the file cannot be written, now or at any later message.
         """
@@ -166,21 +173,27 @@ class RecordedLink:
             yield
 
     def continue_in(self, path: Path) -> None:
-        """Copy the tlog to `path` and continue there, in a fork. Raises as `recording` does."""
+        """Copy the tlog to `path`, and write further records there. For a fork of the process.
+
+        Raises RecordError as `recording` does.
+        """
         self._tlog.continue_in(path)
 
     @property
     def rivals(self) -> str:
-        """Message that names two autopilots that send to this end; "" if there is only one."""
+        """Error text that names two autopilots that send to this end, or "" if only one does."""
         rival = self._transport.rival_address
         return f"{TWO_AUTOPILOTS}, {self._transport.address} and {rival}" if rival else ""
 
     def receive(self, timeout_s: float) -> bytes:
-        """Return the next bytes, or b"" after `timeout_s`. Raises LinkLost if the peer closed."""
+        """Return the next bytes to arrive, or b"" if none arrive within `timeout_s` seconds.
+
+        Raises LinkLost if the other end closed the connection.
+        """
         return self._transport.receive(timeout_s)
 
     def messages(self, data: bytes, stamp_s: float) -> list[Message]:
-        """Return the messages that received bytes contain, and record their frames at the stamp."""
+        """Decode received bytes, record their frames at the stamp, and return their messages."""
         messages = self._codec.decode(data, datagram=self._transport.datagram)
         self._record(stamp_s, list(map(frame_of, messages)))
         return messages

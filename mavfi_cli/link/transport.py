@@ -44,20 +44,21 @@ class Transport(ABC):
 
     @property
     def rival_address(self) -> str:
-        """Address of a second autopilot that sends to this end; "" if there is none."""
+        """Address of a second autopilot that sends to this end, or "" if there is none."""
         return ""
 
     @abstractmethod
     def send(self, data: bytes) -> None:
         """Send whole frames. Datagrams may be lost. Raises LinkLost if the connection is lost.
 
-        Empty `data` continues an earlier send to a slow client of a listener.
+        With empty `data`, an unfinished earlier send to a slow client of a listener continues.
         """
 
     def receive(self, timeout_s: float) -> bytes:
-        """Return the next bytes, or b"" after `timeout_s` (inf: no limit).
+        """Return the next bytes to arrive, or b"" if none arrive within `timeout_s` seconds.
 
-        Raises LinkLost if the peer closed the connection, or the device was removed.
+        With an infinite timeout, wait without a limit. Raises LinkLost if the peer closed the
+        connection, or the device was removed.
         """
         data = self._pull()
         if data or timeout_s <= 0.0:
@@ -70,23 +71,29 @@ class Transport(ABC):
         return data
 
     def await_peer(self, timeout_s: float) -> bool:
-        """Wait at most `timeout_s` for a peer. Return True if there is one."""
+        """Wait at most `timeout_s` seconds for a peer to connect. Return True if there is one."""
         return timeout_s >= 0.0
 
     @abstractmethod
     def fileno(self) -> int:
-        """Return the descriptor that is readable when data has arrived; -1 without a descriptor."""
+        """Return the file descriptor that becomes readable when data arrives, or -1 without one."""
 
     @abstractmethod
     def close(self) -> None:
-        """Release the socket or device. May be called repeatedly."""
+        """Release the socket or device. Safe to call more than once."""
 
     @abstractmethod
     def _pull(self) -> bytes:
-        """Return bytes that have arrived, without waiting; b"" if none. Raises LinkLost."""
+        """Return the bytes that have arrived, without waiting, or b"" if none have.
+
+        Raises LinkLost as `receive` does.
+        """
 
     def _await(self, event: int, timeout_s: float) -> bool:
-        """Wait at most `timeout_s` (inf: no limit). Return True for the poll event or an error."""
+        """Wait at most `timeout_s` seconds for a poll event. Return True if it occurs.
+
+        An error of the descriptor also counts. With an infinite timeout, wait without a limit.
+        """
         poller = select.poll()
         poller.register(self.fileno(), event)
         return bool(poller.poll(None if math.isinf(timeout_s) else timeout_s * 1e3))
@@ -96,13 +103,13 @@ class Transport(ABC):
 
 
 class Listener(Protocol):
-    """Accepts the peers of one URL: all clients of a listening one, or the only peer of another."""
+    """Accepts the peers of one URL: every client if the URL listens, otherwise its only peer."""
 
     def accept_ready(self) -> Sequence[Transport]:
-        """Return the peers that appeared since the last call, without waiting."""
+        """Return the peers that have connected since the last call, without waiting."""
 
     def fileno(self) -> int:
-        """Return the descriptor that becomes readable when `accept_ready` may return peers."""
+        """Return the file descriptor that becomes readable when `accept_ready` may return peers."""
 
     def close(self) -> None:
         """Stop listening. This also closes UDP peers, because they share the socket."""
@@ -115,7 +122,7 @@ def open_transport(
     allow_unsigned: bool = False,
     admits: Callable[[bytes], bool] = begins_with_frame,
 ) -> Transport:
-    """Open one end of a link.
+    """Open the end of a link that `url` describes.
 
     Args:
         url: `udpin:[host]:port`, `udpout:host:port`, `tcp:host:port`, `tcpin:[host]:port`,
@@ -149,7 +156,7 @@ def open_listener(
     admits: Callable[[bytes], bool] = begins_with_frame,
     buffer: int = _BACKLOG,
 ) -> Listener:
-    """Open an endpoint for several peers. Errors are those of `open_transport`.
+    """Open an endpoint that accepts several peers. Raises the same errors as `open_transport`.
 
     Args:
         url, signed, allow_unsigned: As in `open_transport`. `url` may also be an open transport,
@@ -205,7 +212,7 @@ class _SocketOwner:
 
 
 def _text_of(address: Any) -> str:
-    """Return an address as "host:port"; "" for None or an unnamed Unix domain socket."""
+    """Return an address as "host:port", or "" for None or an unnamed Unix domain socket."""
     return f"{address[0]}:{address[1]}" if address else ""
 
 
@@ -252,7 +259,7 @@ class _Stream(_SocketOwner, Transport):
             self._waiting.popleft()
 
     def _push(self, data: bytes) -> bytes:
-        """Send as much as the socket accepts, and return the rest."""
+        """Send as many bytes as the socket accepts, and return the rest."""
         try:
             return data[self._socket.send(data) :]
         except BlockingIOError:
@@ -284,7 +291,10 @@ class _StreamListener(_SocketOwner):
         self._peers: list[_Stream] = []
 
     def accept_ready(self, *, patient: bool = False) -> list[_Stream]:
-        """Return the new clients, as patient streams or as streams that drop data."""
+        """Return the clients that have connected since the last call.
+
+        If `patient` is true, their streams wait for a slow reader. Otherwise they drop data.
+        """
         clients: list[_Stream] = []
         while True:
             try:
@@ -448,7 +458,7 @@ class _Udp(_SocketOwner, Transport):
 
 
 def _receive_datagram(opened: socket.socket, limit: int) -> tuple[bytes, Any]:
-    """Return a datagram of up to `limit` bytes and its sender; b"" and None if there is none.
+    """Return a datagram of up to `limit` bytes and its sender, or b"" and None if none has arrived.
 
     ECONNREFUSED means that no process listens at the other end of a connected socket. It is not an
     error for UDP, because the peer may start later.
@@ -460,7 +470,10 @@ def _receive_datagram(opened: socket.socket, limit: int) -> tuple[bytes, Any]:
 
 
 def _send_datagrams(opened: socket.socket, data: bytes, peer: Any) -> None:
-    """Send to `peer`, or to the connected address. Data that cannot be sent is lost."""
+    """Send frames to `peer`, or to the connected address if `peer` is None.
+
+    Data that cannot be sent is lost.
+    """
     for datagram in _split_frames(data):
         for _attempt in range(2):  # the first may report the refusal of an earlier datagram
             try:
@@ -474,7 +487,7 @@ def _send_datagrams(opened: socket.socket, data: bytes, peer: Any) -> None:
 
 
 def _split_frames(data: bytes) -> list[bytes]:
-    """Group well-formed frames into datagrams that each fit into an Ethernet packet."""
+    """Split well-formed frames into datagrams, each small enough for one Ethernet packet."""
     if len(data) <= _MTU_PAYLOAD:
         return [data]
     datagrams, start, position = [], 0, 0

@@ -30,7 +30,7 @@ _PERIOD_S = 0.02  # cycle of running and stopping a slowed program
 
 
 class LinkInjector(Injector):
-    """Strikes one kind of message that passes between autopilot and companion.
+    """Strikes messages of one kind that pass between the autopilot and the companion.
 
     Args:
         shortest_flight_s, listener: As for `Injector`.
@@ -68,13 +68,16 @@ class LinkInjector(Injector):
 
     @property
     def missed(self) -> str:
-        """The reason why the fault never struck."""
+        """The reason why the fault never struck, as text for the record."""
         if self._locked:
             return "the frames are signed, and key_file names no key to sign them again"
         return super().missed
 
     def pass_between(self, message: Message, side: Side, moment: Moment) -> list[Message]:
-        """Return the messages to pass on in place of a message."""
+        """Return the messages to pass on in place of `message`.
+
+        Unless the fault strikes, they are the message itself. A swapped message follows the next.
+        """
         if message.get_msgId() != self._number or self._only not in (None, side):
             return [message]
         self._count += 1
@@ -119,13 +122,13 @@ class LinkInjector(Injector):
         return struck
 
     def deliver(self, message: Message, side: Side, stamp_s: float) -> None:
-        """Record a message's arrival. The receiver reads every field except those it ignores."""
+        """Record that a message has arrived, and which of its fields the receiver reads."""
         read = {state.name for state in self._states if not is_ignored(message, state)}
         self.follower.read(message, _RECEIVERS[side], stamp_s, read)
 
 
 class Throttle(threading.Thread):
-    """Lets a program run for a share of every 20 ms, and stops it for the rest.
+    """Slows a program down: lets it run for a share of every 20 ms, and stops it for the rest.
 
     The signals go to the program's process group. With a share of 0 the program is stopped until
     `end`.
@@ -158,12 +161,12 @@ class Throttle(threading.Thread):
 
 
 class CompanionFault(NoInjection):
-    """A fault in a user's companion. The base class injects none.
+    """Injection of a fault in a user's companion. This base class injects no fault.
 
     Attributes:
         running: The started programs by name.
         link: Injector for messages; None for a fault in a process.
-        ends: How a struck process died, by the name of its program.
+        ends: How a struck process ended, by the name of its program.
     """
 
     running: Mapping[str, RunningProgram] = MappingProxyType({})
@@ -171,10 +174,10 @@ class CompanionFault(NoInjection):
     ends: Mapping[str, NodeEnds] = MappingProxyType({})
 
     def aim_at(self, shortest_flight_s: float) -> None:
-        """Draw the fault. A random trigger time lies within `shortest_flight_s` after take-over."""
+        """Draw the fault. A random trigger time falls within `shortest_flight_s` of take-over."""
 
     def tick(self, moment: Moment) -> None:
-        """Strike a process when the fault is due, and end a temporary effect on time."""
+        """Strike a process if the fault is due, and end a temporary effect when its time is up."""
 
 
 class CompanionInjection(CompanionFault, SourceInjection):
@@ -185,8 +188,8 @@ class CompanionInjection(CompanionFault, SourceInjection):
         signing: As for `LinkInjector`.
 
     Raises:
-        FaultSpecError: A user's companion has no such target.
-        UnknownName: It has no such program, message or field.
+        FaultSpecError: The target of the fault does not exist in a user's companion.
+        UnknownName: This companion has no such program, or MAVLink no such message or field.
     """
 
     def __init__(
@@ -199,7 +202,7 @@ class CompanionInjection(CompanionFault, SourceInjection):
         check_companion_fault(config, programs)
 
     def aim_at(self, shortest_flight_s: float) -> None:
-        """See `CompanionFault`."""
+        """Draw the fault, as described in `CompanionFault.aim_at`."""
         config = self._config
         if config.killed_node is not None:
             self.injector = Killer(config, shortest_flight_s, self._on_strike)
@@ -215,19 +218,19 @@ class CompanionInjection(CompanionFault, SourceInjection):
         self._stage = config.wire_target[0] or "message"
 
     def tick(self, moment: Moment) -> None:
-        """See `CompanionFault`."""
+        """Strike a process if the fault is due, and end a slowdown when its time is up."""
         self.injector.strike(moment)
         if self._throttle is not None and moment.stamp_s >= self._until_s:
             self._throttle.end()
             self._throttle = None
 
     def close(self) -> None:
-        """Let a stopped program continue, so that it can end."""
+        """End a slowdown that still lasts, so that the stopped program can end."""
         if self._throttle is not None:
             self._throttle.end()
 
     def _on_strike(self, strike: Strike) -> None:
-        """Record the first strike before it takes effect. If it targets a process, strike that."""
+        """Record the first strike before it takes effect, then kill or slow a targeted process."""
         first = self._state == "planned"
         super()._on_strike(strike)
         if first and not strike.changes:
@@ -248,7 +251,10 @@ class CompanionInjection(CompanionFault, SourceInjection):
 
 
 def check_companion_fault(config: FaultConfig, programs: Mapping[str, Any]) -> None:
-    """Reject a fault unsuited to a user's companion. Raises what `CompanionInjection` raises."""
+    """Raise an error if a fault cannot be injected into a user's companion.
+
+    The errors are those of `CompanionInjection`.
+    """
     if config.wire_target is not None:
         config.draw_wire()
     elif config.killed_node is not None:

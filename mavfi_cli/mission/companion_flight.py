@@ -59,11 +59,11 @@ _SETPOINT = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
 
 
 class CompanionFlight:
-    """One flight, from the start of the first program to its outcome.
+    """One flight of a user's companion, from the start of its first program to the outcome.
 
     Args:
         link: Open link to the vehicle. The caller closes it.
-        interrupts: Received signals that request the end.
+        interrupts: Signals received so far that request the end of the flight.
 
     Attributes:
         programs: At the end, how often each program has started and how its processes ended.
@@ -123,18 +123,18 @@ class CompanionFlight:
 
     @property
     def detection(self) -> dict[str, Any] | None:
-        """Checks and alarms of the gate; None without one."""
+        """The record of the gate's checks and alarms, or None if the flight has no gate."""
         return None if self._gate is None else self._gate.summary()
 
     def close(self) -> None:
-        """Close the companion's link."""
+        """Close the link to the companion."""
         self._router.close()
 
     def fly(self, folder: RunFolder, briefing: Briefing, depth: Path | None) -> None:
-        """Fly until there is an outcome.
+        """Fly until the mission has an outcome.
 
         Args:
-            depth: Path of the socket with the vehicle's depth frames; None if it has none.
+            depth: Path of the socket that sends the vehicle's depth frames, or None without one.
 
         Raises:
             MavfiError: A program cannot be started, or the record cannot be written.
@@ -169,19 +169,19 @@ class CompanionFlight:
         self._judge()
 
     def explain(self, why: str) -> None:
-        """Add the failure of the vehicle's process to the reason for a lost link."""
+        """If the link was lost, append the failure of the vehicle's process to the reason."""
         if self.outcome is Outcome.LINK_LOST:
             self.reason = f"{self.reason}: {why}"
 
     def _shortest_flight_s(self, briefing: Briefing) -> float:
-        """Return the length of the interval from which a random fault time is drawn, s."""
+        """Return the length in seconds of the interval from which a random fault time is drawn."""
         way_m = norm(briefing.goal_enu_m - briefing.start_enu_m)
         return self._companion.flight_s or way_m / self._config.v_max_mps
 
     def _placeholders(
         self, folder: RunFolder, briefing: Briefing, depth: Path | None
     ) -> dict[str, str]:
-        """Return the text that replaces each placeholder in a program's command, by placeholder."""
+        """Return the values of the placeholders in the programs' commands, keyed by placeholder."""
         end = parse_endpoint(self._companion.url)
         port = self._router.port if end.scheme in LISTENING else end.port
         called = end.scheme in LISTENING
@@ -211,7 +211,10 @@ class CompanionFlight:
         return [frame for own in passed for frame in self._deliver(own, side)]
 
     def _gated(self, message: Message, side: Side) -> Iterable[Message]:
-        """Return the messages that the gate passes on."""
+        """Return the messages that the gate passes on in place of a message.
+
+        Also send the frames of the gate itself.
+        """
         if self._gate is None:
             return (message,)
         passed = self._gate.pass_between(message, side, self.stamp_s)
@@ -224,7 +227,10 @@ class CompanionFlight:
         return passed
 
     def _deliver(self, message: Message, side: Side) -> Iterable[bytes]:
-        """Record what reaches the receiver in place of a message, and return its frames."""
+        """Record the messages that reach the receiver in place of `message`.
+
+        Return their frames.
+        """
         passed = self._gated(message, side)
         for own in passed:
             if side is Side.COMPANION:
@@ -392,7 +398,7 @@ class LockstepFlight(CompanionFlight):
             ("effect", stops and fault is not None and fault.effect != Effect.FLIP.value),
         ):
             if by_wall:
-                raise ConfigError("needs a companion with time = 'wall'", key=key)
+                raise ConfigError("works only with a companion that sets time = 'wall'", key=key)
 
     def _turn(self) -> None:
         """Start the program and await its connection. After that, await the next answer or tick."""
@@ -406,7 +412,10 @@ class LockstepFlight(CompanionFlight):
         self._judge()
 
     def _look_after(self) -> None:
-        """End the flight after too long a wait; let it continue once the companion has ended."""
+        """End the flight if the vehicle or the companion has been silent for too long.
+
+        Once the companion has ended, answer the vehicle's ticks in its place.
+        """
         waited_s, limit_s = time.monotonic() - self._since_s, self._companion.answer_limit_s
         if self.outcome is not None:
             pass
@@ -458,7 +467,7 @@ class LockstepFlight(CompanionFlight):
         )
 
     def _go_on(self) -> None:
-        """Answer the tick in place of the companion, unless the flight has ended."""
+        """Answer the vehicle's tick in place of the companion, unless the flight has ended."""
         if self.outcome is None:
             self._awaited_ms, self._since_s = None, time.monotonic()
             self._link.send(self._release())
@@ -472,7 +481,10 @@ class LockstepFlight(CompanionFlight):
         )
 
     def _hear(self, message: Message) -> None:
-        """Handle a message from the vehicle. After the last one of a tick, strike and judge."""
+        """Handle a message from the vehicle.
+
+        After the last message of a tick, strike if the fault is due, and judge the flight.
+        """
         super()._hear(message)
         if self._is_tick(message):
             self._strike()
@@ -489,13 +501,13 @@ class _Verdict:
     """Decides whether a flight has succeeded.
 
     Attributes:
-        goal_enu_m: Goal (3,).
+        goal_enu_m: Goal, of shape (3,), in metres.
         landed: True if the vehicle has flown and stands disarmed on the ground.
         flew: True once the vehicle has been in the air.
 
     Raises:
         RecordError: The golden flight that defines the corridor cannot be read.
-        ConfigError: The golden flight has no path.
+        ConfigError: The trace of the golden flight has fewer than two positions.
     """
 
     def __init__(self, success: SuccessConfig, crew: Crew) -> None:
@@ -508,7 +520,7 @@ class _Verdict:
         self._path = None if success.golden is None else path_of(Path(success.golden))
 
     def see(self, state: VehicleState) -> None:
-        """Handle a new state."""
+        """Update the verdict with a new state of the vehicle."""
         if self._path is not None:
             self.deviation_m = max(
                 self.deviation_m, distance_from(state.position_enu_m, self._path)
@@ -526,7 +538,7 @@ class _Verdict:
             self._rests = state.stamp_s - self._rest_since_s >= _REST_S
 
     def describe(self) -> str:
-        """Describe the conditions of success."""
+        """Describe the conditions of success that are configured."""
         success = self._success
         parts = (
             "" if success.goal_m is None else f"at rest within {success.goal_m:g} m of the goal",
@@ -543,9 +555,9 @@ class _Verdict:
         return corridor_m is not None and self.deviation_m > corridor_m
 
     def is_over(self) -> bool:
-        """Return True if all given conditions except the corridor hold.
+        """Return True if all configured conditions of success hold, apart from the corridor.
 
-        If there are none, return True once every program has ended.
+        If no such condition is configured, return True once every program has ended.
         """
         success = self._success
         ends = (
@@ -557,7 +569,7 @@ class _Verdict:
 
 
 def path_of(folder: Path) -> FloatArray:
-    """Read the path (n, 3) of a flight from its run folder, ENU, m.
+    """Read the path of a flight from its run folder: positions (n, 3) in ENU, in metres.
 
     Raises:
         RecordError: The trace cannot be read.
@@ -569,12 +581,12 @@ def path_of(folder: Path) -> FloatArray:
     except KeyError:
         path = np.zeros((0, 3))
     if len(path) < 2:
-        raise ConfigError("the golden flight has no path", key="success.golden")
+        raise ConfigError("the golden trace has fewer than two positions", key="success.golden")
     return path
 
 
 def distance_from(place: FloatArray, path: FloatArray) -> float:
-    """Return the distance from a point (3,) to a polyline (n, 3), m."""
+    """Return the distance, in metres, from a point of shape (3,) to a polyline of shape (n, 3)."""
     begin, along = path[:-1], np.diff(path, axis=0)
     lengths = np.maximum((along**2).sum(axis=1), 1e-12)
     shares = np.clip(((place - begin) * along).sum(axis=1) / lengths, 0.0, 1.0)

@@ -46,7 +46,14 @@ class Crew:
         self._throttles: list[Throttle] = []
 
     def prepare(self, programs: Programs, values: dict[str, str]) -> None:
-        """Fill in the placeholders of all commands. Raises UnknownName for an unknown one."""
+        """Fill in the placeholders in the commands of all programs.
+
+        Args:
+            values: Value of each placeholder, by its name.
+
+        Raises:
+            UnknownName: A command contains an unknown placeholder.
+        """
         self._programs = programs
         self._tasks = {name: _task(program, values) for name, program in self._waiting}
 
@@ -58,12 +65,12 @@ class Crew:
             self._throttles.append(Throttle(self.running[name], share))
 
     def close(self) -> None:
-        """Let slowed programs run, so that they can end."""
+        """Let slowed programs run at full speed, so that they can end."""
         for throttle in self._throttles:
             throttle.end()
 
     def manage(self, stamp_s: float, state: VehicleState | None) -> None:
-        """Log the starts and ends of programs. Start the next program if the newest is ready.
+        """Log new starts and ends of programs. Start the next program if the newest one is ready.
 
         Raises:
             MavfiError: A program cannot be started.
@@ -114,7 +121,7 @@ class Crew:
             return probe.connect_ex(("127.0.0.1", port)) == 0
 
     def summary(self) -> dict[str, ProgramEnds]:
-        """Return how often each program has started, and the exit codes of its processes."""
+        """Return each program's number of starts and the exit codes of its processes, by name."""
         return {
             name: ProgramEnds(starts=program.starts, codes=[*program.codes])
             for name, program in self.running.items()
@@ -122,7 +129,7 @@ class Crew:
 
     @property
     def ready(self) -> bool:
-        """True once every program has been ready."""
+        """True once every program has become ready."""
         return not self._waiting
 
     @property
@@ -137,26 +144,32 @@ class Crew:
         return rule == "never" or (rule == "on-failure" and program.codes[-1] == 0)
 
     def failure(self) -> str:
-        """Describe the failure of a program that will not restart; empty if there is none."""
+        """Describe the failure of a program that will not restart.
+
+        Return an empty string if no program has failed like this.
+        """
         for name, program in self.running.items():
             if program.codes and program.codes[-1] and self._is_over(name):
                 return f"{name} {_how(program.codes[-1])}"
         return ""
 
     def ended(self) -> str:
-        """Describe a program that has ended, even if it will restart; empty if all are running."""
+        """Name a program that has ended, even if it will restart.
+
+        Return an empty string if all started programs are running.
+        """
         for name, program in self.running.items():
             if program.codes and program.pid is None:
                 return f"the program {name} is gone"
         return ""
 
     def succeeded(self, name: str) -> bool:
-        """Return True if a program has ended with code 0 and will not restart."""
+        """Return True if the program has ended with exit code 0 and will not restart."""
         return name in self.running and self._is_over(name) and self.running[name].codes[-1] == 0
 
 
 def _how(code: int) -> str:
-    """Describe the end of a process, given its exit code."""
+    """Describe how a process ended, given its exit code, which is -N after signal N."""
     if code >= 0:
         return f"ended with code {code}"
     with contextlib.suppress(ValueError):

@@ -76,9 +76,11 @@ class ForeignClock:
         self.heard = False
 
     def believes(self, stamp_s: float, limit_s: float) -> bool:
-        """Return False for a stamp that is not newer, or that jumps ahead by more than a limit.
+        """Return False if the stamp of a state is not plausible.
 
-        A jump is accepted as a new clock if a second state follows the first within the limit.
+        A stamp must be newer than that of the newest state, by at most `limit_s`. A jump beyond
+        this limit is accepted as a new clock if the stamp of the next state follows within the
+        limit.
         """
         leaps = stamp_s > self.stamp_s + limit_s
         follows = self._doubted_s < stamp_s <= self._doubted_s + limit_s
@@ -86,7 +88,7 @@ class ForeignClock:
         return follows or (self.stamp_s < stamp_s and not leaps)
 
     def hear(self, stamp_s: float) -> None:
-        """Note a new state."""
+        """Set the clock to the stamp of a new state."""
         now_s = self._wall()
         if not self.heard or stamp_s < self.stamp_s:
             self.heard, self._first, self._pace = True, (stamp_s, now_s), 1.0
@@ -96,17 +98,20 @@ class ForeignClock:
             self._pace = min(1.0, flown_s / passed_s)
 
     def wait(self, waited_s: float) -> None:
-        """Add wall-clock time that passed without a new state."""
+        """Add wall-clock time that has passed without a new state."""
         self._waited_s += waited_s
 
     @property
     def silence_s(self) -> float:
-        """Estimated vehicle time since the newest state, at most the wall-clock time, s."""
+        """Estimated vehicle time since the newest state, in seconds.
+
+        It is at most the wall-clock time since that state.
+        """
         return self._waited_s * self._pace
 
     @property
     def now_s(self) -> float:
-        """Estimate of the vehicle's time."""
+        """The time on the vehicle's clock now, estimated in seconds."""
         return self.stamp_s + self.silence_s
 
 
@@ -164,7 +169,7 @@ class Flight:
 
     @property
     def place_enu_m(self) -> FloatArray:
-        """Position of the vehicle (3,), available after `connect`."""
+        """Position of the vehicle, of shape (3,), in metres. Available after `connect`."""
         assert self._session.state is not None
         return self._session.state.position_enu_m
 
@@ -180,13 +185,13 @@ class Flight:
         """
         while self._session.phase is Phase.CONNECTING:
             if self._interrupts:
-                raise Interrupted("interrupted")
+                raise Interrupted("interrupted before the flight began")
             self._turn()
         if self._session.failure is not None:
             raise self._session.failure
 
     def brief(self, briefing: Briefing, recorder: Recorder | None) -> Companion:
-        """Adopt the briefing, draw the fault, and create the companion.
+        """Store the briefing, draw the fault, and create and return the companion.
 
         Args:
             recorder: Records the briefing and the inputs of the nodes.
@@ -206,13 +211,13 @@ class Flight:
         return self.companion
 
     def take(self, config: MissionConfig, tlog: Path) -> None:
-        """Continue the flight in a fork of the process as a mission with its own fault and tlog."""
+        """Continue the flight, in a fork of its process, as another mission with its own tlog."""
         self._config = config
         self.link.continue_in(tlog)
         self.lose_nodes_as(config)
 
     def lose_nodes_as(self, config: MissionConfig) -> None:
-        """Adopt the restart and watchdog times of another mission."""
+        """Use the restart and watchdog times of another mission when a node is lost."""
         if self.companion is not None:
             executor = self.companion.executor
             executor.restart_s = config.node_restart_s
@@ -224,7 +229,7 @@ class Flight:
         If that process is lost, the node restarts with fresh state.
 
         Args:
-            process: As for `Executor.isolate`.
+            process: Process that runs the node, as for `Executor.isolate`.
         """
         assert self.companion is not None
         assert self._briefing is not None
@@ -236,7 +241,7 @@ class Flight:
         return executor
 
     def _shortest_flight_s(self, briefing: Briefing) -> float:
-        """Return a lower bound on the flight time from the take-over to the goal, s."""
+        """Return a lower bound, in seconds, on the flight time from take-over to the goal."""
         takeoff = np.add(briefing.start_enu_m, (0.0, 0.0, self._config.takeoff_height_m))
         way_m = norm(briefing.goal_enu_m - takeoff) - self.stack.goal_tolerance_m
         turn_s = TURN_S if self.stack.turns_before_departure else 0.0
@@ -312,7 +317,7 @@ class Flight:
         self.logger.note(self.stamp_s, "outcome", text, self._session.state)
 
     def explain(self, why: str) -> None:
-        """Add the failure of the vehicle's process to the reason for a lost link."""
+        """If the link was lost, append the failure of the vehicle's process to the reason."""
         if self.outcome is Outcome.LINK_LOST:
             self.reason = f"{self.reason}: {why}"
 
@@ -329,7 +334,10 @@ class Flight:
             raise LinkLost(f"the simulated vehicle sent nothing for {self._patience_s:g} s")
 
     def _turn_by_wall(self, clock: ForeignClock) -> None:
-        """Take a turn with a foreign autopilot: a tick, or idle messages without a new state."""
+        """Receive messages of a foreign autopilot, and run the control tick of its newest state.
+
+        If no new state has arrived, send idle messages instead.
+        """
         begun_s = time.monotonic()
         data = self._receive(IDLE_S)
         waited_s = time.monotonic() - begun_s
@@ -350,7 +358,7 @@ class Flight:
             return self.link.receive(timeout_s)
 
     def _take(self, data: bytes) -> float | None:
-        """Handle the messages in the data. Return the stamp of the newest state, s, or None."""
+        """Handle the messages in `data`. Return the newest state's stamp in seconds, if any."""
         newest_s, telemetry = None, self._session.telemetry
         with self.wall.sample("link"):
             for message in self.link.messages(data, self.stamp_s):
@@ -482,7 +490,10 @@ class Flight:
 
     @property
     def _blind_s(self) -> float:
-        """Return how long the next frame of a foreign autopilot's camera is overdue, s."""
+        """Time, in seconds, by which the next frame of a foreign autopilot's camera is overdue.
+
+        It is negative if the frame is not due yet, and 0 if no frame is expected.
+        """
         if not self._camera_called or self._config.link is None:
             return 0.0
         return self.stamp_s - self._seen_s - 1.0 / self._config.camera_rate_hz

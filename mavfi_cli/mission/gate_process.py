@@ -41,8 +41,9 @@ class GateProcess:
 
     Attributes:
         autopilot, companion: URLs of the two links.
-        mark: Companion for which the model must have been made; None for any.
-        process: Process id of the companion, or a file that holds it; None to watch no process.
+        mark: Companion for which the detector's model must have been made; None allows any.
+        process: Process id of the companion, or the path of a file that contains it; None to watch
+            no process.
         log: File to which one line of JSON per event is appended; None to write no log.
         key_file: File with the signing passphrase of both links.
         allow_unsigned: Allow an unsigned link to another machine.
@@ -59,7 +60,7 @@ class GateProcess:
     allow_unsigned: bool = False
 
     def run(self) -> int:
-        """Run until interrupted. Return the exit code.
+        """Run the gate until it is interrupted, and return the exit code for this process.
 
         Raises:
             MavfiError: A link cannot be opened, or the model cannot be used.
@@ -97,7 +98,7 @@ class _Passing:
 
 
 class _Worker:
-    """The forked process. It routes frames and, unless the gate has failed, judges setpoints."""
+    """The forked process that routes frames and, unless the gate has failed, judges setpoints."""
 
     def __init__(
         self, process: GateProcess, router: Router, passing: _Passing, log: int | None
@@ -112,7 +113,10 @@ class _Worker:
             os.write(self._log, json.dumps(line).encode() + b"\n")
 
     def work(self, alive: int, *, judges: bool) -> int:
-        """Route until the supervisor ends this process. Write to the pipe `alive` in every turn."""
+        """Route frames until the supervisor ends this process. Return the exit code after an error.
+
+        In every turn, write to the pipe `alive`, so that the supervisor sees a sign of life.
+        """
         return exit_code(lambda: self._route(alive, judges=judges))
 
     def _route(self, alive: int, *, judges: bool) -> None:
@@ -150,7 +154,11 @@ def _closed(message: Message, side: Side) -> Sequence[Message]:
 
 
 def _supervise(worker: _Worker, interrupts: Sequence[int], *, judges: bool) -> int | None:
-    """Run a worker. Return its exit code, or 0 if interrupted, or None if it died or hung."""
+    """Fork a worker and supervise it until it ends.
+
+    Return its exit code, 0 if this process was interrupted, or None if the worker was killed or
+    hung.
+    """
     reading, writing = os.pipe()
     child = fork(lambda: worker.work(writing, judges=judges))
     os.close(writing)
@@ -179,7 +187,10 @@ class _Watch:
         self._next_s, self._gone = 0.0, ""
 
     def gone(self) -> str:
-        """Return why the process is gone; empty while it runs or if none is watched."""
+        """Return a message if the companion's process is gone, or an empty string if it is not.
+
+        If no process is watched, the string is always empty.
+        """
         if self._process is None or time.monotonic() < self._next_s:
             return self._gone
         self._next_s = time.monotonic() + _LOOK_S
@@ -195,6 +206,6 @@ class _Watch:
 
 
 def require_process(process: str | None) -> None:
-    """Raise MavfiError if the process to be watched is not running."""
+    """Raise MavfiError if a process is to be watched but is not running."""
     if why := _Watch(process).gone():
         raise MavfiError(why)

@@ -33,12 +33,13 @@ _FLIGHTS = 20  # maximum number of flights to search for planning problems
 
 
 def record_inputs(config: MissionConfig) -> tuple[KernelInputs, ...]:
-    """Fly the mission without a fault and return inputs of all kernels, spread over the flight.
+    """Fly a golden run and return inputs of all kernels, spread over the flight.
 
-    If one flight has too few planning problems, flights with the next seeds supply the rest.
+    Every member of the result has one input per kernel. If the flight has too few planning problems
+    with obstacles, flights with the next seeds supply the rest.
 
     Raises:
-        TargetError: A flight did not reach its goal, or a kernel has too few inputs.
+        TargetError: A flight did not reach its goal, or it has too few inputs of a kernel.
         MavfiError: The mission could not begin.
     """
     name, recorder = _flight_name(config), _flown(config)
@@ -48,7 +49,7 @@ def record_inputs(config: MissionConfig) -> tuple[KernelInputs, ...]:
     }
     frames, clouds, ticks = given.values()
     if min(len(frames), len(clouds), len(ticks)) < 2 * INPUTS_A_KERNEL:
-        raise TargetError(name, "the flight is too short to record the inputs of kernels")
+        raise TargetError(name, "the flight is too short to record inputs; choose another seed")
     params = tracking.TrackingParams(v_max_mps=config.v_max_mps, a_max_mps2=config.a_max_mps2)
     kernels = zip(
         _spread(frames),
@@ -85,12 +86,18 @@ def _flown(config: MissionConfig) -> Recorder:
 
 
 def _spread(of: Sequence[_Any], number: int = INPUTS_A_KERNEL) -> list[_Any]:
-    """Return `number` equally spaced members, including the middle one if `number` is odd."""
+    """Return `number` equally spaced members of a sequence.
+
+    If `number` is odd, they include the middle one.
+    """
     return [of[(2 * k + 1) * len(of) // (2 * number)] for k in range(number)]
 
 
 def _checks(name: str, recorder: Recorder) -> list[CollisionInputs]:
-    """Return inputs of the collision check, including some with a collision if there are any."""
+    """Return recorded inputs of the collision check.
+
+    Up to _FORESEEN of them, if the flight has that many, have a trajectory that collides.
+    """
     free: list[CollisionInputs] = []
     foreseen: list[CollisionInputs] = []
     for check, stamp_s in recorder.orders.get("collision_check", []):
@@ -101,7 +108,7 @@ def _checks(name: str, recorder: Recorder) -> list[CollisionInputs]:
             (foreseen if report.collision else free).append(alone)
     some = min(_FORESEEN, len(foreseen))
     if len(free) < INPUTS_A_KERNEL - some:
-        raise TargetError(name, "too few trajectories were checked for collisions")
+        raise TargetError(name, "too few checked trajectories were free; choose another seed")
     return _spread(free, INPUTS_A_KERNEL - some) + _spread(foreseen, some)
 
 
@@ -114,12 +121,16 @@ def _problems(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]:
         tasks += _hard_tasks(another, _flown(another))
     raise TargetError(
         _flight_name(config),
-        "there are too few plans around obstacles, even in the flights with the next seeds",
+        "the planner had to avoid obstacles too few times, even in flights with the next seeds; "
+        "choose another world",
     )
 
 
 def _hard_tasks(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]:
-    """Return the planning requests with free ends that a straight line does not solve."""
+    """Return the planning requests that need a detour around an obstacle.
+
+    Their start and goal are free, but the straight line between them is not.
+    """
     assert recorder.briefing is not None
     hard = []
     for (request, snapshot), _ in recorder.orders["planner"]:
@@ -143,7 +154,7 @@ def _hard_tasks(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]
 def _tracked(
     ticks: list[ControlInput], params: tracking.TrackingParams
 ) -> list[tuple[tracking.TrackingState, tracking.TrackingInputs]]:
-    """Return states and inputs of the controller at ticks with a trajectory."""
+    """Return pairs of state and input of the controller, at ticks in which it had a trajectory."""
     following = [index for index, tick in enumerate(ticks) if tick.inputs.trajectory is not None]
     if not following:
         raise TargetError("golden flight", "the vehicle never followed a trajectory")
@@ -159,13 +170,17 @@ def _tracked(
 def kernel_targets(
     kernels: Iterable[str], config: MissionConfig, folder: Path, tolerance: float = 0.0
 ) -> list[KernelTarget]:
-    """Return targets for the named kernels, with inputs from a golden run.
+    """Return an attack target for each named kernel, with inputs recorded in a golden run.
 
-    The inputs are read from the folder. If it has none, they are recorded in a flight and stored
-    there.
+    The inputs are read from the folder. If it contains none, they are recorded in a flight and
+    stored there.
+
+    Args:
+        config: Mission of the golden run.
+        tolerance: As for `KernelTarget`.
 
     Raises:
-        ConfigError: The folder holds inputs from another flight.
+        ConfigError: The folder contains inputs from another flight.
     """
     path = folder / INPUTS
     if not path.is_file():
@@ -189,9 +204,9 @@ def kernel_targets(
 
 
 def kernel_flight(world: str = "dense", seed: int = 3) -> MissionConfig:
-    """Return the golden flight that provides the inputs of `mavfi kernels`.
+    """Return the mission of the golden run that provides the kernels' inputs for `mavfi kernels`.
 
-    Collision check, planner and control use the parameters of `hardened`.
+    Collision check, planner and control use the parameters of the stack `hardened`.
     """
     return MissionConfig(world=world, seed=seed, stack="hardened")
 

@@ -1,4 +1,4 @@
-"""Checks whether this machine can run mavfi. Each check gives a finding and a remedy."""
+"""Checks whether this machine can run mavfi. Each check has a finding and, if needed, a remedy."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FAILED = "failed"  # missions do not work
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check:
-    """The result of one check, with a remedy unless the verdict is OK."""
+    """The result of one check of this machine, with a remedy unless the verdict is OK."""
 
     name: str
     verdict: str
@@ -80,7 +80,7 @@ _INSTALL = "pip install -e . in the project's folder"
 
 
 def check_machine() -> Iterator[Check]:
-    """Run all checks in sequence and yield their results."""
+    """Run all checks of this machine in sequence, and yield their results."""
     yield _check("Python", platform.python_version())
     yield _processor()
     yield _wheels()
@@ -158,10 +158,11 @@ def _physics() -> Check:
 
 
 def check_tracing(mechanism: Mechanism | None = None) -> Check:
-    """Check that a program can be stopped and its registers changed.
+    """Check that mavfi can stop a program and change its registers, as faults require.
 
     Args:
-        mechanism: How executions are counted; the best available one by default.
+        mechanism: How executions of an instruction are counted. By default, it is the best
+            mechanism available.
     """
     from mavfi_cli.fi.tracer.registers import widest_vector
     from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
@@ -190,7 +191,10 @@ def check_tracing(mechanism: Mechanism | None = None) -> Check:
 
 
 def _counting() -> Check:
-    """Report the mechanism that counts executions. Test the fallback if it is needed."""
+    """Check how executions of an instruction are counted: by the kernel, or by the slower fallback.
+
+    The fallback is tested only if the kernel refuses.
+    """
     from mavfi_cli.fi.tracer.tracee import Mechanism, perf_allowed
 
     refused = perf_allowed()

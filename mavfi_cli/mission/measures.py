@@ -46,16 +46,16 @@ QUALITY = tuple(measure.name for measure in fields(QualityOfFlight))
 def quality_of(
     log: Mapping[str, FloatArray], start_s: float, end_s: float, goal_enu_m: FloatArray
 ) -> QualityOfFlight:
-    """Compute the quality of flight: time, distance, energy and clearance.
+    """Compute the quality of flight from a log: time, distance, energy and clearance.
 
     Flight time runs from the companion's take-over at take-off height to the end of the mission, as
     in the paper (section IV), where take-off precedes the measurement. Unknown values are None.
 
     Args:
-        log: Columns with one row per control tick, as in `sitl.referee`. A foreign autopilot has
-            no referee, so its log has only stamp, position and velocity.
-        start_s, end_s: Stamps of the companion's take-over and of the end.
-        goal_enu_m: Goal (3,), m.
+        log: Columns by name with one row per control tick, as in `sitl.referee`. A foreign
+            autopilot has no referee, so its log has only stamp, position and velocity.
+        start_s, end_s: Stamps of the companion's take-over and of the end of the mission.
+        goal_enu_m: Goal, of shape (3,), in metres.
     """
     inside = (log["stamp_s"] >= start_s - 1e-9) & (log["stamp_s"] <= end_s + 1e-9)
     flown = {name: column[inside] for name, column in log.items()}
@@ -85,15 +85,16 @@ def quality_of(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightRecord:
-    """The sections of a result.json. A missing section is empty or None.
+    """The sections of a result.json. A section that the file lacks is empty or None.
 
-    A mission that crashed or hung before it could write its record lacks most of them.
+    A mission that crashed or hung before it could write its record lacks most sections.
 
     Attributes:
         pilot: None in a flight of a user's companion.
         plan_failures: Number of failed plans by reason.
-        state_fault, instruction_fault: The section `fault` of a fault at this level.
-        recorded_fault: The whole section `fault` as plain values.
+        state_fault: The section `fault` if the fault is at source level.
+        instruction_fault: The section `fault` if the fault is at instruction level.
+        recorded_fault: The section `fault` as plain JSON values.
         in_lockstep: True for a flight of a user's companion in lockstep.
         referee: None if the vehicle provided no truth.
         seeds: Seeds of the mission (`root`) and of its fault.
@@ -129,7 +130,7 @@ class FlightRecord:
 
     @classmethod
     def of(cls, result: Json) -> FlightRecord:
-        """Read the sections of a result.json.
+        """Parse the sections of a result.json, given its content.
 
         Raises:
             RecordError: A section is damaged.
@@ -147,12 +148,12 @@ class FlightRecord:
 
     @property
     def fault(self) -> StateFault | MissionInstructionFault | None:
-        """The fault at either level; None without a fault."""
+        """The fault, at source or instruction level, or None if the mission had no fault."""
         return self.state_fault or self.instruction_fault
 
     @property
     def strikes(self) -> Sequence[Strike]:
-        """The recorded strikes of a source-level fault."""
+        """The recorded strikes of a source-level fault; empty if the mission had none."""
         return () if self.state_fault is None else self.state_fault.strikes
 
     @property
@@ -175,7 +176,7 @@ class FlightRecord:
 
 
 def measures_of(flight: FlightRecord) -> dict[str, object]:
-    """Return all measures of a mission.
+    """Return all measures of a mission, keyed by name.
 
     They are those of `fields_of`; `straight_m`, the distance from the take-off point to the
     edge of the goal's tolerance; `crashed`, whether a node died; `struck_s`, `struck_sites` and
@@ -198,7 +199,7 @@ def measures_of(flight: FlightRecord) -> dict[str, object]:
 
 
 def fields_of(flight: FlightRecord) -> dict[str, float | None]:
-    """Return the measures that are copied from fields of a record."""
+    """Return the measures that are copied directly from the record's fields, keyed by name."""
     detection, physics = flight.detection, (flight.referee or {}).get("physics") or {}
     return {
         **asdict(flight.quality_of_flight),
@@ -306,7 +307,10 @@ def _joined(values: Iterable[object]) -> str:
 
 
 def _value(value: float | int | bool | None, pattern: str) -> object:
-    """Return a value. Restore infinities and NaN, which JSON lacks, from their bits."""
+    """Return `value`, or if it is None, the float whose bits `pattern` gives as hexadecimal text.
+
+    A record has None instead of an infinity or NaN, which JSON lacks.
+    """
     if value is not None:
         return value
     return bits.NUMPY_TYPES[_FLOATS[len(pattern)]].value(int(pattern, 16))
@@ -320,26 +324,27 @@ RECOMPUTED = {
     Stage.PLANNING.value: ("planner",),
     Stage.CONTROL.value: ("control",),
 }
-# Note for comparisons of checks with simulated time, because no factor between hosts is known.
+# Printed where checks are compared with simulated time, because no factor between hosts is known.
 HOST_CHECKS = "checks take the time of the host that flew, not scaled to the platform"
 _AGAIN = ("recompute", "hold")  # responses to an alarm that cause a recomputation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectionCost:
-    """Cost of a detector in one flight.
+    """The time that a detector cost in one flight, for its checks and for recomputations.
 
     The cost is "the total detection and recomputation time for each mission" (paper, Table V).
     Checks are measured in host time; recomputations in simulated time, by their latency on the
     flight's platform.
 
     Attributes:
-        flight_s: Flight time, or simulated time of the whole mission if the former is unknown, s.
-        recomputations: Number of recomputations per stage. The record lists the first alarms and
-            only counts the others. Those are distributed over the stages in the same ratio, so
-            numbers may be fractions.
-        recovery_s: Simulated time of the recomputations per stage at the mean latency of the
-            stage's kernels in this flight, s.
+        flight_s: Flight time in seconds, or the simulated time of the whole mission if the flight
+            time is unknown.
+        recomputations: Number of recomputations per stage. The record lists only the first alarms
+            and counts the others. The others are distributed over the stages in the same ratio as
+            the listed alarms, so the numbers may be fractions.
+        recovery_s: Simulated time in seconds of the recomputations per stage, at the mean latency
+            of the stage's kernels in this flight.
     """
 
     detector: str
@@ -355,7 +360,7 @@ class DetectionCost:
 
     @property
     def check_host_s(self) -> float:
-        """Mean host time of a check, s."""
+        """Mean host time of a check, in seconds."""
         return self.checks_host_s / self.checks
 
     @property
@@ -365,7 +370,7 @@ class DetectionCost:
 
     @property
     def recovered_s(self) -> float:
-        """Simulated time of all recomputations, s."""
+        """Simulated time of all recomputations, in seconds."""
         return math.fsum(self.recovery_s.values())
 
     @property
@@ -375,10 +380,11 @@ class DetectionCost:
 
     @classmethod
     def of(cls, flight: FlightRecord) -> DetectionCost | None:
-        """Compute the cost of detection and recovery in a flight.
+        """Compute the cost of detection and recovery in a flight, if its record contains it.
 
         Returns:
-            Cost; None without a detector or without any check.
+            The cost, or None if the flight had no detector, or if its record has no checks, no host
+            time of the checks, or no flight time.
         """
         detection, kernels = flight.detection, flight.kernels
         walls = flight.host.get("stage_wall_s") or {}
@@ -399,7 +405,7 @@ class DetectionCost:
         again = {stage: total * listed.count(stage) / max(len(listed), 1) for stage in RECOMPUTED}
 
         def mean_s(kernel: KernelUse | None) -> float:
-            """Return the mean latency of an invocation, s."""
+            """Return the mean latency of a kernel's invocation in seconds, or 0 if it never ran."""
             if kernel is None or not kernel.invocations:
                 return 0.0
             return kernel.busy_s / kernel.invocations

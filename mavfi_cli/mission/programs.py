@@ -1,4 +1,4 @@
-"""Starts the programs of a user's companion, and always ends them.
+"""Starts the programs of a user's companion, and ends them however the mission ends.
 
 A worker of the fork server runs one program: it starts the program, stores its output, restarts it
 according to its rule, and then keeps running, because the program's children may outlive it. Its
@@ -41,10 +41,10 @@ _GRACE_S = 2.0  # time to end after SIGTERM
 
 
 class Programs:
-    """The running programs of one companion. Closing ends them and all of their descendants.
+    """The running programs of one companion. `close` ends them and all of their descendants.
 
     Args:
-        folder: Folder for the outputs of the programs, one folder per program.
+        folder: Folder for the outputs of the programs, with one subfolder per program.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -54,10 +54,14 @@ class Programs:
         self._running: dict[str, RunningProgram] = {}
 
     def start(self, name: str, task: Mapping[str, Any]) -> RunningProgram:
-        """Start a program. `task` is that of `perform` without "out".
+        """Start a program.
+
+        Args:
+            name: Name of the program, and of the subfolder for its outputs.
+            task: As for `perform`, but without "out", which is set here.
 
         Raises:
-            MavfiError: It cannot be started.
+            MavfiError: The program cannot be started.
         """
         place = own_folder(self._folder / name).resolve()
         own = self._scratch.path / name
@@ -66,7 +70,7 @@ class Programs:
         return program
 
     def close(self) -> None:
-        """Ask the programs to end, then kill what remains of them. May be called repeatedly."""
+        """Ask the programs to end, then kill those that remain. Safe to call more than once."""
         for program in self._running.values():
             program.terminate()
         deadline_s = time.monotonic() + _GRACE_S
@@ -80,12 +84,13 @@ class Programs:
 
 
 class RunningProgram:
-    """A started program, as its worker reports it.
+    """A started program. Its attributes hold the state that its worker last reported.
 
     Attributes:
-        pid: Id of its process, which leads a process group; None while it does not run.
-        codes: Exit codes of its processes so far; a negative one is a signal.
-        ready: True once its ready line has appeared.
+        pid: Id of the program's process, which leads a process group; None while it does not run.
+        codes: Exit codes of the program's earlier processes; -N if signal N killed a process.
+        starts: Number of times that the program has been started.
+        ready: True once a line of its stdout has matched "ready_line".
     """
 
     def __init__(self, name: str, folder: Path, channel: socket.socket) -> None:
@@ -98,7 +103,7 @@ class RunningProgram:
         self._events = open(open_own(folder / _EVENTS, os.O_RDONLY), "rb")  # noqa: SIM115
 
     def poll(self) -> bool:
-        """Read the worker's reports. Return False if the worker itself is gone."""
+        """Read the worker's new reports. Return False if the worker itself has ended."""
         *lines, self._rest = (self._rest + self._events.read()).split(b"\n")
         for line in lines:
             event = json.loads(line)
@@ -113,14 +118,17 @@ class RunningProgram:
         return not poller.poll(0)
 
     def failure(self) -> str:
-        """Return why the worker is gone."""
+        """Return why the worker ended. Call it only after `poll` has returned False."""
         while packet := self._channel.recv(PACKET):
             if report := (json.loads(packet).get("report") or {}):
                 return str(report.get("text") or report.get("traceback"))
         return "its process was killed"
 
     def signal(self, number: int, *, group: bool = False) -> bool:
-        """Send a signal to its process, or to its process group. Return False if there is none."""
+        """Send signal `number` to the program's process, or to its process group.
+
+        Return False if the program is not running.
+        """
         self.poll()
         if self.pid is None:
             return False
@@ -131,7 +139,7 @@ class RunningProgram:
         return True
 
     def terminate(self) -> None:
-        """Resume the program if it is stopped, and ask it to end."""
+        """Resume the program if it is stopped, and ask it to end (SIGTERM)."""
         for number in (signal.SIGCONT, signal.SIGTERM):
             self.signal(number, group=True)
 
@@ -145,11 +153,11 @@ class RunningProgram:
 
 
 def prepare() -> None:
-    """Do nothing, because a worker needs no further modules."""
+    """Load nothing: the fork server calls this first, but a worker needs no further modules."""
 
 
 def perform(task: Mapping[str, Any], _folder: Path) -> NoReturn:
-    """Run a program until the guard ends this process.
+    """Run a program, and restart it according to its rule, until the guard kills this process.
 
     Args:
         task: "argv", "folder", "environment", "restart", "restart_s" and "ready_line", as in
@@ -174,7 +182,7 @@ def perform(task: Mapping[str, Any], _folder: Path) -> NoReturn:
 
 
 class _Kept:
-    """A file that keeps the beginning of an output, up to _MOST_BYTES."""
+    """The file of one output stream, of which it keeps the first _MOST_BYTES bytes."""
 
     def __init__(self, undo: contextlib.ExitStack, path: Path) -> None:
         self._file: BinaryIO = undo.enter_context(
@@ -194,7 +202,7 @@ class _Kept:
 
 
 class _Ready:
-    """Searches the lines of stdout for the one that signals readiness."""
+    """Searches a program's stdout for the line that signals its readiness."""
 
     def __init__(self, pattern: str | None) -> None:
         self._pattern = None if pattern is None else re.compile(pattern.encode())
@@ -212,7 +220,7 @@ class _Ready:
 
 
 def _run(task: Mapping[str, Any], kept: Mapping[str, _Kept], report: Any) -> int:
-    """Start the program and keep its output until it ends. Return its exit code."""
+    """Start the program, store its output until it ends, and return its exit code."""
     try:
         process = subprocess.Popen(
             task["argv"], cwd=task["folder"], env={**os.environ, **task["environment"]},
@@ -238,7 +246,10 @@ def _pump(
     until_s: float,
     process: subprocess.Popen[bytes] | None = None,
 ) -> None:
-    """Store outputs and report readiness until a process has ended or until a given time."""
+    """Store the program's outputs and report its readiness.
+
+    Return once `process` has ended, or at the monotonic time `until_s`.
+    """
     ended = None if process is None else os.pidfd_open(process.pid)
     try:
         while (left_s := until_s - time.monotonic()) > 0.0:
@@ -267,7 +278,7 @@ def _open_pipes(kept: Mapping[str, _Kept]) -> Iterator[int]:
 
 
 def _read(pipe: int, output: _Kept) -> bytes:
-    """Return the bytes waiting in a pipe. Close the pipe at EOF."""
+    """Return the bytes that wait in a pipe, which may be none. At end of file, close the pipe."""
     with contextlib.suppress(BlockingIOError):
         if data := os.read(pipe, _CHUNK):
             return data

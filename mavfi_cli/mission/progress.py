@@ -26,7 +26,7 @@ _MODES = {  # kind and text of the event that marks the start of a pilot mode
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightProgress:
-    """State of the flight, reported once per simulated second."""
+    """The progress of a flight, reported to a `Watcher` once per simulated second."""
 
     stamp_s: float
     phase: str
@@ -36,7 +36,7 @@ class FlightProgress:
 
 
 class Watcher:
-    """Receives progress and events. The base class ignores them."""
+    """Receives the progress and the events of a flight. The base class ignores them."""
 
     def on_progress(self, progress: FlightProgress) -> None:
         """Handle a progress report, once per simulated second."""
@@ -45,13 +45,14 @@ class Watcher:
         """Handle the announcement of a long operation that is not part of the flight."""
 
     def on_event(self, event: Event) -> None:
-        """Handle an event."""
+        """Handle an event of the flight when it is logged."""
 
 
 class Recorder:
-    """Records the briefing, and the input and start stamp of every invocation, by node.
+    """Records the briefing of a flight, and the inputs of its nodes.
 
     Attributes:
+        orders: Input and start stamp of every invocation, by node.
         sequence: Node of every invocation, in order of start.
     """
 
@@ -61,7 +62,7 @@ class Recorder:
         self.sequence: list[str] = []
 
     def on_start(self, node: str, value: Any, start_s: float) -> None:
-        """Record the start of an invocation."""
+        """Record the input and the start stamp of an invocation of a node."""
         self.orders.setdefault(node, []).append((value, start_s))
         self.sequence.append(node)
 
@@ -87,7 +88,11 @@ class FlightLogger:
 
     @staticmethod
     def event(stamp_s: float, kind: str, text: str, place_enu_m: FloatArray | None) -> Event:
-        """Return an event with stamp and position (3,) rounded as in a record."""
+        """Return an event whose stamp and position are rounded as in a record.
+
+        Args:
+            place_enu_m: Position, of shape (3,).
+        """
         place = None
         if place_enu_m is not None:
             x, y, z = (round(float(c), 3) for c in place_enu_m)
@@ -101,7 +106,7 @@ class FlightLogger:
         companion: Companion | None,
         injection: NoInjection,
     ) -> None:
-        """Log the events of a tick, and report progress once per simulated second."""
+        """Log the new events of a control tick, and report progress once per simulated second."""
         state, phase = session.state, session.phase
         if phase is not self._phase:
             self._phase = phase
@@ -126,7 +131,7 @@ class FlightLogger:
             )
 
     def log_texts(self, stamp_s: float, telemetry: Telemetry) -> None:
-        """Log the autopilot's new texts."""
+        """Log the text messages from the autopilot that are new since the last call."""
         texts = telemetry.texts
         for received in texts.since(self._texts):
             if self._noted_texts <= _MOST_TEXTS:

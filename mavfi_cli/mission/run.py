@@ -69,19 +69,21 @@ def fly_mission(
     shared: SharedFlight | None = None,
     host: Mapping[str, Any] | None = None,
 ) -> RunFolder:
-    """Fly one mission from start to end and write its run folder.
+    """Fly one mission from start to end, write its record, and return its run folder.
 
-    Every end of the flight is recorded as a result, even a crash of the companion.
+    However the flight ends, the record states its outcome, even if the companion crashes.
 
     Args:
         out: parent of the run folder.
         recorder: records the inputs of the nodes.
-        repeat: record of the instruction-level fault to repeat; None draws a new fault.
-        profiles: folder for the profiles of instruction-level faults; None for one in `out`.
-        for_debugger: called once the node waits for a debugger at the injected instruction.
+        repeat: record of the instruction-level fault to repeat. If None, a new fault is drawn.
+        profiles: folder that keeps the profiles for instruction-level faults. If None, it is a
+            subfolder of `out`.
+        for_debugger: called with the id of the attacked node's process once that process waits
+            for a debugger at the injected instruction.
         launch: starts the simulated vehicle.
         shared: missions to fork from this flight; the flight itself then writes no record.
-        host: further entries of the record's host section.
+        host: further entries for the host section of the record.
 
     Raises:
         SystemExit: this process has completed the shared flight.
@@ -135,7 +137,10 @@ def fly_mission(
 def _fly_companion(
     config: MissionConfig, out: Path, watcher: Watcher, repeat: FaultRecord | None
 ) -> RunFolder:
-    """Fly a mission of a user's companion. Raises what `fly_mission` raises."""
+    """Fly a mission with the programs of a user's companion, and return its run folder.
+
+    Raises the same errors as `fly_mission`.
+    """
     assert config.companion is not None
     programs = CompanionConfig.load(config.companion)
     if config.detector is not None:
@@ -206,7 +211,10 @@ def _plan_injection(
     repeat: FaultRecord | None,
     for_debugger: Callable[[int], None] | None,
 ) -> NoInjection:
-    """Plan the fault of a mission. The arguments are those of `fly_mission`."""
+    """Return the injection of a mission's fault, or `NoInjection` if the mission has no fault.
+
+    The arguments are those of `fly_mission`.
+    """
     if config.fault is not None:
         return SourceInjection(config.fault)
     if config.instruction is None:
@@ -231,10 +239,10 @@ def _warm_up(config: MissionConfig, watcher: Watcher) -> None:
 def _begin(
     flight: Flight, config: MissionConfig, vehicle: Vehicle | None, recorder: Recorder | None
 ) -> Companion:
-    """Connect and brief the flight.
+    """Connect the flight to the vehicle, pass it the briefing, and return its companion.
 
     Raises:
-        MavfiError: the flight cannot begin; the vehicle's own reason takes precedence.
+        MavfiError: the flight cannot begin. If the vehicle itself failed, its error is raised.
     """
     try:
         flight.connect()
@@ -251,7 +259,7 @@ def _begin(
 
 
 def _fly(flight: Flight, tlog: Path) -> str | None:
-    """Fly to the end; return the traceback if the companion's software crashed."""
+    """Fly until the mission ends. Return the traceback if the companion's software crashed."""
     try:
         flight.fly(tlog)
     except MavfiError:
@@ -268,7 +276,11 @@ def _fly(flight: Flight, tlog: Path) -> str | None:
 def _host(
     config: MissionConfig, flight: Flight | CompanionFlight, truth: FlightTruth | None
 ) -> Json:
-    """Return properties and measurements of this machine, which may vary between repetitions."""
+    """Return the entries of the record's host section.
+
+    They are properties and measurements of this machine, so they may differ between repetitions of
+    a flight.
+    """
     own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     of_vehicle = {} if truth is None else truth.stage_wall_s
     walls = {"stage_wall_s": flight.wall.totals, "vehicle_stage_wall_s": of_vehicle}
@@ -333,7 +345,7 @@ def _flown(
     truth: FlightTruth | None,
     goal_enu_m: FloatArray,
 ) -> Json:
-    """Return the sections that every flight's record has."""
+    """Return the sections that every record has, with mavfi's companion or a user's."""
     assert flight.outcome is not None
     fault, report = config.fault or config.instruction, {} if truth is None else truth.report
     flown = flight.trace.motion() if truth is None else truth.log
@@ -390,7 +402,10 @@ def _nodes(companion: Companion) -> dict[str, NodeEnds]:
 
 
 def response_times(reactions: Sequence[Reaction]) -> ResponseTime:
-    """Return the median and 95th percentile of the response times, s, and their number."""
+    """Return the median and 95th percentile of the response times in seconds, and their count.
+
+    A response time runs from a depth frame to the first setpoint that depends on it.
+    """
     times = np.array([r.setpoint_stamp_s - r.frame_stamp_s for r in reactions])
     times = times[np.isfinite(times)]
     if not len(times):
@@ -406,10 +421,13 @@ def response_times(reactions: Sequence[Reaction]) -> ResponseTime:
 
 
 def fly_to_end(config: MissionConfig, out: Path, **options: Any) -> Run:
-    """Fly a mission; an interruption is an error. The options are those of `fly_mission`.
+    """Fly a mission and return its run. Unlike `fly_mission`, raise an error if it is interrupted.
+
+    Args:
+        out, options: As for `fly_mission`.
 
     Raises:
-        Interrupted: The user interrupted the mission. Nothing of it is kept.
+        Interrupted: The user interrupted the mission. Its run folder is deleted.
         MavfiError: As for `fly_mission`.
     """
     flown = load_run(fly_mission(config, out, Watcher(), **options).path)
@@ -420,14 +438,15 @@ def fly_to_end(config: MissionConfig, out: Path, **options: Any) -> Run:
 
 
 def fly_golden(config: MissionConfig, out: Path, recorder: Recorder) -> Run:
-    """Fly a golden run from which faults or inputs are drawn. Raises what `fly_to_end` raises.
+    """Fly a golden run, and record the inputs of its nodes for later draws of faults or inputs.
 
     Raises:
-        VehicleProcessError: The vehicle died.
+        VehicleProcessError: The process of the vehicle died.
+        MavfiError: As for `fly_to_end`.
     """
     flown = fly_to_end(config, out, recorder=recorder)
     if flown.record.referee is None:
-        raise VehicleProcessError("the vehicle process of the golden flight died")
+        raise VehicleProcessError("the vehicle process died during the golden flight")
     return flown
 
 
@@ -439,7 +458,7 @@ def fly_again(
     firmware: str | None = None,
     **options: Any,
 ) -> Run:
-    """Repeat a run or fly its golden run. Raises what `fly_to_end` raises.
+    """Fly the mission of a recorded run again, or its golden run if `with_fault` is False.
 
     Args:
         firmware: as for `Run.mission`.
@@ -447,6 +466,7 @@ def fly_again(
 
     Raises:
         RecordError: The run is not repeatable.
+        MavfiError: As for `fly_to_end`.
     """
     from mavfi_cli.fi.tracer.record import read  # loads the tracer
 
@@ -456,11 +476,13 @@ def fly_again(
 
 
 def watch_again(run: Run) -> tuple[Recorder, bool]:
-    """Repeat a run to capture the inputs of its nodes. Raises what `fly_again` raises.
+    """Repeat a recorded run to capture the inputs of its nodes.
+
+    Raises the same errors as `fly_again`.
 
     Returns:
-        Inputs of all nodes, and whether the repetition has the same trace. The trace differs only
-        if the software or the machine differs.
+        A recorder with the inputs of all nodes, and whether the repetition has the same trace as
+        the run. The traces differ only if the software or the machine differs.
     """
     recorder = Recorder()
     with ScratchFolder("again") as scratch:
@@ -470,7 +492,9 @@ def watch_again(run: Run) -> tuple[Recorder, bool]:
 
 
 def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run:
-    """Return a run's golden run. It is flown once and then kept in the run's folder.
+    """Return the golden run that is paired with a run. If none is stored, fly and store it.
+
+    The golden run is stored in the folder of the run.
 
     Args:
         run: Run with a fault.
@@ -478,7 +502,7 @@ def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run
 
     Raises:
         RecordError: The run is not repeatable, or its folder cannot be written.
-        Interrupted: The user interrupted the golden run. Nothing of it is kept.
+        Interrupted: The user interrupted the golden run. Nothing of it is stored.
     """
     config = run.mission(with_fault=False)
     if (golden := run.golden) is not None:

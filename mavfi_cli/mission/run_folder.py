@@ -54,12 +54,12 @@ _PLAN = {"stamp_s": np.float64, "trajectory_seq": np.int32, "future_collision_se
 BRIEFING = "briefing.json"
 # Arrays in a briefing's file, with their lengths. The camera itself reports its field of view.
 BRIEFED = {"start_enu_m": 3, "goal_enu_m": 3, "bounds_enu_m": 6, "camera_offset_flu_m": 3}
-COMPANION_VARIES = "a flight of a user's companion does not repeat"
+COMPANION_VARIES = "a flight of a user's companion is not repeatable"
 _RESPONSE = "response"  # rows of reactions, from the frame's stamp to the setpoint's
 
 
 class RunFolder:
-    """Paths of a run folder, with its tables of plans and kernels."""
+    """The paths of the files in a run folder, and methods that write and read its tables."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -77,9 +77,10 @@ class RunFolder:
 
     @classmethod
     def new(cls, parent: Path, world: str, seed: int) -> RunFolder:
-        """Create an empty folder `<world>-<seed>-<number>`. Safe for parallel missions.
+        """Create an empty run folder in `parent`, named `<world>-<seed>-<number>`.
 
-        Characters of the world's name that are unfit for paths are replaced.
+        The number makes the name unique, even if several missions create folders at the same time.
+        Characters of the world's name that are unfit for paths are replaced by "-".
 
         Raises:
             RecordError: The folder cannot be created.
@@ -101,12 +102,16 @@ class RunFolder:
         raise AssertionError("unreachable")
 
     def write_briefing(self, briefing: Briefing) -> None:
-        """Write the briefing for the programs of a user's companion. Raises RecordError."""
+        """Write the briefing to a file for the programs of a user's companion.
+
+        Raises:
+            RecordError: The file cannot be written.
+        """
         own_folder(self.programs)
         write_json(self.briefing, {name: getattr(briefing, name) for name in BRIEFED})
 
     def write_plans(self, plans: Sequence[Trajectory]) -> None:
-        """Write all plans that the mission logic received, with one row per waypoint."""
+        """Write a table of all plans that the mission logic received, one row per waypoint."""
         import pyarrow as pa
 
         lengths = [len(plan.waypoints) for plan in plans]
@@ -121,7 +126,7 @@ class RunFolder:
         write_parquet(self.plans, pa.table(columns))
 
     def read_plans(self) -> list[Trajectory]:
-        """Read the plans. Plans without waypoints are missing, because they have no row.
+        """Read the plans from their table. Plans without waypoints, which have no row, are omitted.
 
         Raises:
             RecordError: The file is missing, damaged, or of another format.
@@ -143,7 +148,11 @@ class RunFolder:
     def write_timetable(
         self, invocations: Sequence[Invocation], reactions: Sequence[Reaction]
     ) -> None:
-        """Write the timetable: kernel, start and end of each invocation, then the reactions."""
+        """Write the timetable: one row per kernel invocation, then one row per reaction.
+
+        A row has the name of the kernel, and its start and end in seconds. The row of a reaction
+        starts at the depth frame and ends at the setpoint.
+        """
         import pyarrow as pa
 
         rows = [(run.node, run.start_s, run.end_s) for run in invocations]
@@ -156,9 +165,9 @@ class RunFolder:
         write_parquet(self.kernels, pa.table(columns))
 
     def read_timetable(self) -> tuple[list[Invocation], list[Reaction]]:
-        """Read the timetable: invocations in the order of their starts, and reactions.
+        """Read the timetable. Return the kernel invocations in order of start, and the reactions.
 
-        An output takes effect at the invocation's end, unless the node died or was killed.
+        An invocation's output takes effect at its end, unless the node died or was killed.
 
         Raises:
             RecordError: The file is missing, damaged, or of another format.
@@ -196,7 +205,10 @@ _KINDS: tuple[type[Message], ...] = (CollisionReport, Trajectory, Command)
 
 
 class Trace:
-    """Collects the trace's rows in memory: about 200 bytes per tick, or 36 MB per flight hour."""
+    """Collects the trace of a flight in memory, with one row per control tick.
+
+    A row takes about 200 bytes, so an hour of flight takes 36 MB.
+    """
 
     def __init__(self) -> None:
         self._stamps: list[float] = []
@@ -213,7 +225,11 @@ class Trace:
         trajectory: tuple[Trajectory, int] | None,
         command: Command | None,
     ) -> None:
-        """Add a tick: the companion's inputs and decisions."""
+        """Add the row of one control tick: the companion's inputs and decisions.
+
+        Args:
+            trajectory: The tracked trajectory with the index of its current waypoint.
+        """
         self._stamps.append(stamp_s)
         self._phases.append(phase)
         self._vehicle.append(
@@ -227,7 +243,11 @@ class Trace:
         return len(self._stamps)
 
     def motion(self) -> dict[str, FloatArray]:
-        """Return the received stamps (n,) s, positions (n, 3) m and velocities (n, 3) m/s, ENU."""
+        """Return the motion of the vehicle as received, in arrays keyed by column name.
+
+        The stamps have shape (n,), in seconds. The positions, in m, and the velocities, in m/s,
+        have shape (n, 3), in ENU.
+        """
         vehicle = np.array(self._vehicle, dtype=np.float64).reshape(-1, len(_STATE_COLUMNS))
         return {
             "stamp_s": np.array(self._stamps),
@@ -236,11 +256,13 @@ class Trace:
         }
 
     def table(self, truth: Mapping[str, FloatArray] | None) -> pa.Table:
-        """Return a table of stamp, phase, vehicle, monitored states and the referee's truth.
+        """Return the trace as a table with one row per control tick.
 
-        The stamps of report and trajectory and the index of the waypoint identify the messages that
-        contain the states. A state is null before its first message. Truth is joined by stamp.
-        Foreign autopilots also have stamps between the referee's rows, where truth is interpolated.
+        The columns are the stamp, the phase, the vehicle's state, the monitored states, and the
+        referee's truth unless `truth` is None. The stamps of report and trajectory and the index of
+        the waypoint identify the messages that contain the monitored states. A state is null before
+        its first message. Truth is joined by stamp. Foreign autopilots also have stamps between the
+        referee's rows, where truth is interpolated.
         """
         import pyarrow as pa
 
@@ -291,7 +313,7 @@ _Entry = tuple[Message, int] | None  # a message and the index of its waypoint
 
 
 def _distinct(entries: Sequence[_Entry]) -> tuple[list[_Entry], list[int]]:
-    """Return the entries without consecutive repetitions, and for each row its entry's index."""
+    """Return the entries without consecutive repetitions, and each row's index into that list."""
     kept: list[_Entry] = []
     rows, last = [], (0, 0)
     for entry in entries:
@@ -304,7 +326,10 @@ def _distinct(entries: Sequence[_Entry]) -> tuple[list[_Entry], list[int]]:
 
 
 def _between(before: FloatArray, after: FloatArray, shares: FloatArray) -> FloatArray:
-    """Interpolate linearly; a share of 0 returns the first value, even if it is infinite."""
+    """Interpolate linearly between `before` (share 0) and `after` (share 1).
+
+    Where the share is 0, the result is exactly `before`, even if a value is infinite.
+    """
     with np.errstate(invalid="ignore"):
         mixed: FloatArray = np.where(shares == 0.0, before, before + shares * (after - before))
     return mixed
@@ -315,7 +340,7 @@ def _between(before: FloatArray, after: FloatArray, shares: FloatArray) -> Float
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Parting:
-    """First value in which two runs differ."""
+    """The first value in which the traces of two runs differ."""
 
     stamp_s: float
     column: str
@@ -328,7 +353,10 @@ class Run:
     """A run read from its folder.
 
     Attributes:
-        to_html: Function that renders a run's summary and picture; set by `mavfi_cli.library`.
+        to_html: Function that renders a run's summary and picture as HTML; set by
+            `mavfi_cli.library`.
+        result: Content of the run's result.json.
+        trace: None if the run folder has no trace.
     """
 
     to_html: ClassVar[Callable[[Run], str] | None] = None
@@ -340,70 +368,72 @@ class Run:
         return f"Run({str(self.folder.path)!r}, outcome={self.record.outcome!r})"
 
     def _repr_html_(self) -> str | None:
-        """Return the notebook's view; None unless the library is loaded."""
+        """Return HTML for a notebook to display, or None if `mavfi_cli.library` is not loaded."""
         return None if Run.to_html is None else Run.to_html(self)
 
     @property
     def record(self) -> FlightRecord:
-        """The sections of the result."""
+        """The sections of the run's result.json."""
         with reading(self.folder.result):
             return FlightRecord.of(self.result)
 
     @property
     def golden(self) -> Run | None:
-        """The complete golden run in the folder; None if there is none."""
+        """The golden run in the run's folder, or None if it is missing or was interrupted."""
         path = self.folder.golden
         golden = load_run(path) if path.is_dir() else None
         return None if golden is None or golden.record.interrupted else golden
 
     def mission(self, *, with_fault: bool = True, firmware: str | None = None) -> MissionConfig:
-        """Return the configuration of the run, or of its golden run if `with_fault` is False.
+        """Return the mission of this run, or of its golden run if `with_fault` is False.
 
         The golden run has no detector either, because it is the reference for fault and detection.
 
         Args:
-            firmware: The program that the run may name; see `MissionConfig.require_programs`.
+            firmware: The firmware program that the run's record is allowed to name; see
+                `MissionConfig.require_programs`.
 
         Raises:
-            ConfigError: The run names another program.
+            ConfigError: The record names another program.
             RecordError: The run is not repeatable: it used a foreign autopilot or measured
                 times, was interrupted by the user, or named a file that has changed since.
         """
         record, path, why = self.record, self.folder.path, ""
         if record.interrupted:
-            why = "an interrupted flight does not repeat"
+            why = "the flight was interrupted, so it is not repeatable"
         elif record.config.get("link") is not None:
-            why = "a flight of a foreign autopilot does not repeat"
+            why = "a flight of a foreign autopilot is not repeatable"
         elif record.config.get("companion") is not None:
             why = COMPANION_VARIES
         elif PlatformProfile.factor_of(record.config.get("platform", "")) is not None:
-            why = "a flight on measured kernel times does not repeat"
+            why = "a flight on measured kernel times is not repeatable"
         config = structure(dict(record.config), MissionConfig, path=self.folder.result)
         with reading(self.folder.result):
             for name, digest in {**dict.fromkeys(config.files, ""), **record.files}.items():
                 if not why and not (digest and file_digest(name) == digest):
                     changed = Path(name).exists()
                     how = "has changed since this flight" if changed else "does not exist"
-                    why = f"{name} {how}, so the flight does not repeat"
+                    why = f"{name} {how}, so the flight cannot be repeated"
         if why:
             raise RecordError(f"{path}: {why}")
         config.require_programs(firmware)
         return config if with_fault else config.golden
 
     def differing_sections(self, other: Run) -> list[str]:
-        """Return the sections in which two results differ, except the host's."""
+        """Return the names of the result sections in which two runs differ, ignoring `host`."""
         keys = sorted({*self.result, *other.result} - {"host"})
         return [key for key in keys if self.result.get(key) != other.result.get(key)]
 
     def first_difference(
         self, other: Run, *, truth: bool = False, leave_out: Collection[str] = ()
     ) -> _Parting | None:
-        """Find the first difference between the traces of two runs; None if they are equal.
+        """Return the first difference between the traces of two runs, or None if they are equal.
 
         If several columns first differ in the same tick, the earliest in the pipeline is returned:
-        perception, planning, control, then the vehicle. If the traces are equal as far as both go,
-        outcomes and numbers of ticks are compared. The referee's truth is ignored by default.
-        Columns in `leave_out`, and columns that one run lacks, are also ignored.
+        perception, planning, control, then the vehicle. If all ticks that both traces contain are
+        equal, the outcomes and the numbers of ticks are compared. The referee's truth is ignored
+        unless `truth` is True. Columns in `leave_out`, and columns that one run lacks, are also
+        ignored.
 
         Raises:
             RecordError: A run has no trace.
@@ -441,9 +471,10 @@ class Run:
         return None
 
     def largest_deviation_m(self, other: Run) -> float:
-        """Return the largest distance between two vehicles at equal stamps, m; NaN without a trace.
+        """Return the largest distance between the vehicles of two runs in the same tick, in m.
 
-        After the end of its flight, a vehicle keeps its last position.
+        After the end of its flight, a vehicle keeps its last position. The distance is NaN if
+        either run has no trace.
         """
         if not (self.trace and other.trace):
             return float("nan")
@@ -466,8 +497,8 @@ def load_run(path: str | Path) -> Run:
     if not folder.path.is_dir():
         raise RecordError(f"{path}: no such run folder")
     if not folder.result.is_file():
-        hint = "cut off before its end" if folder.tlog.exists() else "not a run folder"
-        raise RecordError(f"{folder.path}: no {RESULT} ({hint})")
+        hint = "the run was cut off before its end" if folder.tlog.exists() else "not a run folder"
+        raise RecordError(f"{folder.path}: {RESULT} is missing ({hint})")
     result = read_json(folder.result, _LARGEST_RESULT)
     trace = read_parquet(folder.trace, "trace") if folder.trace.is_file() else None
     if result.get("schema") != 1:

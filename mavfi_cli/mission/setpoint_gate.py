@@ -33,7 +33,7 @@ _BRAKE = 0b1101_1100_0111  # type_mask of a velocity-only setpoint
 
 @dataclass(slots=True)
 class _Counts:
-    """Numbers of anomalous or stale setpoints, by what was sent in their place."""
+    """Numbers of anomalous or stale setpoints, by what the gate sent in their place."""
 
     hold: int = 0  # the last accepted setpoint
     brake: int = 0  # a standstill
@@ -44,11 +44,11 @@ class _Counts:
 
 
 class SetpointGate:
-    """The gate of one link.
+    """The gate between one companion and its autopilot.
 
     Args:
-        mark: Companion for which the model must have been made; None for any.
-        note: Receives one line per event.
+        mark: Companion for which the detector's model must have been made; None allows any.
+        note: Called with one line of text per event.
         signing: Key of the link, for signing replacement setpoints and the gate's own messages.
         gone: Returns why the companion's process is gone; empty while it runs.
 
@@ -88,7 +88,10 @@ class SetpointGate:
 
     @staticmethod
     def warm_up(detector: DetectorConfig, mark: StackMark | None) -> None:
-        """Load and compile all code of a gate in advance. Raises what the constructor raises."""
+        """Load and compile all code that a gate needs, in advance.
+
+        Raises the same errors as the constructor.
+        """
         gate = Gate(detector.build_for_companion(mark))
         still = Command(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=0.0)
         plan = Trajectory(
@@ -156,7 +159,10 @@ class SetpointGate:
         return self._standstill(message)
 
     def _staleness(self, message: Message, now_s: float) -> str:
-        """Return why setpoints that no longer change are stale; empty if they are not."""
+        """Return why a setpoint is stale, or an empty string if it is not.
+
+        Setpoints are stale if they no longer change, and the companion or its heartbeat is gone.
+        """
         content = tuple(
             getattr(message, name) for name in message.fieldnames if name != "time_boot_ms"
         )
@@ -171,7 +177,10 @@ class SetpointGate:
         return "the companion's heartbeat is gone" if silent else ""
 
     def _again(self, message: Message) -> list[Message]:
-        """Return the last accepted setpoint with the header and time of a withheld one."""
+        """Return the last accepted setpoint, with the header and time of the withheld `message`.
+
+        Return an empty list if it is of another type or cannot be signed.
+        """
         assert self._accepted is not None
         if self._accepted.get_msgId() != message.get_msgId():
             return []
@@ -181,7 +190,10 @@ class SetpointGate:
         return [] if valid is None else [valid]
 
     def _standstill(self, message: Message) -> list[Message]:
-        """Return a setpoint with zero velocity. It becomes the reference for the next."""
+        """Return a setpoint with zero velocity, to be sent in place of `message`.
+
+        It becomes the reference for the next setpoint.
+        """
         still = Command(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=self._yaw_rad)
         trajectory, index, _ = self._view.sample(message)
         if self._gate.judge_tick(trajectory, index, still) is not None:
@@ -225,7 +237,7 @@ class SetpointGate:
         self._say(f"setpoint {doing}: {blamed}: {alarm.detector} {alarm.score:.3g}", now_s)
 
     def _say(self, text: str, now_s: float) -> None:
-        """Note an event, and send it as STATUSTEXT; both at most once a second."""
+        """Note an event, and send it as STATUSTEXT. Events within 1 s of the last are dropped."""
         if now_s - self._noted_s < _TEXT_EVERY_S:
             return
         self._noted_s = now_s if math.isfinite(now_s) else self._noted_s
@@ -236,7 +248,7 @@ class SetpointGate:
             self.outbox.append(self._codec.encode(message))
 
     def summary(self) -> dict[str, Any]:
-        """Return checks, alarms and responses as plain values."""
+        """Return the record of the gate's checks, alarms and responses, as plain JSON values."""
         counts = self._counts
         names = ("hold", "brake", "autopilot", "stale", "none")
         responses = {name: getattr(counts, name) for name in names}
@@ -253,5 +265,8 @@ class SetpointGate:
 
 
 def foreign_name(name: str) -> str:
-    """Return the name of a detector's input in a foreign companion; see `setpoints`."""
+    """Rename a detector's input for a user's companion, such as `waypoint_x` to `state_x`.
+
+    There, the inputs have another meaning, which the module `setpoints` describes.
+    """
     return name.replace("waypoint_", "state_").replace("command_", "setpoint_")

@@ -41,7 +41,7 @@ _DEGREE_M = 1e-7 * 111_319.5  # one unit of lat_int
 
 
 class SetpointView:
-    """The autopilot's newest state, to which setpoints refer."""
+    """Converts setpoints to samples, relative to the autopilot's newest state."""
 
     def __init__(self) -> None:
         self.telemetry = Telemetry()
@@ -50,14 +50,17 @@ class SetpointView:
         self._trajectory: Trajectory | None = None
 
     def hear(self, message: Message) -> None:
-        """Handle a message from the autopilot."""
+        """Update the state from a message of the autopilot."""
         if not isinstance(message, dialect.MAVLink_unknown):
             self.telemetry.handle(message)
         if message.get_msgId() == dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT:
             self._global = message
 
     def sample(self, setpoint: Message) -> tuple[Trajectory | None, int, Command]:
-        """Return the arguments of `Gate.judge_tick` for a setpoint."""
+        """Convert a setpoint to a detector sample: the arguments of `Gate.judge_tick`.
+
+        The trajectory is None if the autopilot has not sent its state yet.
+        """
         state = self.telemetry.state
         if state is not None and state is not self._state:
             x, y, z = state.position_enu_m.tolist()
@@ -73,11 +76,15 @@ class SetpointView:
 def command_of(
     setpoint: Message, state: VehicleState | None, global_position: Message | None = None
 ) -> Command:
-    """Return the yaw, and the displacement within 1 s, that a setpoint requests, in ENU.
+    """Return a command with the yaw and the displacement within 1 s that a setpoint requests.
+
+    The command holds the displacement as its velocity, in ENU. For SET_ATTITUDE_TARGET, it holds
+    (roll, pitch, thrust) there instead.
 
     Args:
         state: Newest state of the vehicle.
-        global_position: Its newest GLOBAL_POSITION_INT, for setpoints with latitude and longitude.
+        global_position: The vehicle's newest GLOBAL_POSITION_INT, needed for setpoints with
+            latitude and longitude.
     """
     yaw_rad = 0.0 if state is None else state.yaw_rad
     stamp_s = 0.0 if state is None else state.stamp_s
@@ -114,7 +121,11 @@ def command_of(
 def _position_errors(
     setpoint: Message, state: VehicleState | None, here: Message | None
 ) -> tuple[float, float, float]:
-    """Return the displacement from the vehicle to the target in the setpoint's frame, m."""
+    """Return the displacement from the vehicle to the target, in metres.
+
+    Its axes are those of the setpoint's frame. Without a global position, the displacement to a
+    target with latitude and longitude is 0.
+    """
     if setpoint.get_msgId() == _GLOBAL:
         if here is None:
             return 0.0, 0.0, 0.0
@@ -130,7 +141,10 @@ def _position_errors(
 
 
 def _euler(q: list[float]) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw of a quaternion (w, x, y, z), rad; NaN unless it is finite."""
+    """Return the roll, pitch and yaw of a quaternion (w, x, y, z), in radians.
+
+    They are NaN if the quaternion is not finite.
+    """
     if not all(map(math.isfinite, q)):
         return math.nan, math.nan, math.nan
     w, x, y, z = (value / (math.hypot(*q) or 1.0) for value in q)
@@ -142,7 +156,7 @@ def _euler(q: list[float]) -> tuple[float, float, float]:
 
 
 def samples_of_tlog(path: Path, world: str, seed: int) -> FlightSamples:
-    """Return the samples of the setpoints in the .tlog of a fault-free flight.
+    """Convert the setpoints in the .tlog file of a fault-free flight to detector samples.
 
     Args:
         world, seed: World and seed that identify the flight in its data set.

@@ -49,7 +49,7 @@ M = TypeVar("M")
 
 
 class _Flight(Protocol):
-    """The parts of `flight.Flight` that are used here."""
+    """The attributes and methods of `flight.Flight` that a shared flight uses."""
 
     wall: WallClock
     stamp_s: float
@@ -79,10 +79,10 @@ Branch = tuple[MissionConfig, Path]  # a mission, and the parent of its run fold
 
 
 class SharedFlight(NoInjection):
-    """The injection of a shared flight; in a fork, that of the fork's mission.
+    """The injection of a shared flight. In a fork, it is the injection of the fork's mission.
 
     Args:
-        branches: missions by number, equal except for their faults.
+        branches: missions by number, equal except for their faults and how they restart nodes.
         fork: forks this process for a mission and returns True in the fork; in this process,
             returns False after the fork's end.
         strike: strikes nodes in rehearsals, for missions with instruction-level faults; receives
@@ -129,16 +129,16 @@ class SharedFlight(NoInjection):
 
     @property
     def _own(self) -> NoInjection | None:
-        """The injection of this fork's mission; None in the shared flight."""
+        """The injection of this fork's mission, or None in the shared flight."""
         return None if self.config is None else next(iter(self._injections.values()))
 
     @property
     def in_queue(self) -> bool:  # type: ignore[override]
-        """See `NoInjection`."""
+        """True in a fork whose mission has its injection site in control's copy of the plan."""
         return self._own is not None and self._own.in_queue
 
     def aim(self, shortest_flight_s: float, protection: NoProtection) -> None:
-        """Draw the faults. A mission whose fault cannot be drawn is not forked."""
+        """Draw the source-level faults. A mission whose fault cannot be drawn is not forked."""
         for number, injection in list(self._injections.items()):
             try:
                 injection.aim(shortest_flight_s, protection)
@@ -147,7 +147,7 @@ class SharedFlight(NoInjection):
             injection.injector.follower = self.injector.follower  # which the companion updates
 
     def news(self) -> list[str]:
-        """See `NoInjection`."""
+        """Return the new lines of text about the fault of this fork; none in the shared flight."""
         if self._own is not None:
             return self._own.news()
         if self._requests and self.recorder is not None and self.recorder.sequence:
@@ -156,11 +156,14 @@ class SharedFlight(NoInjection):
         return []
 
     def finish(self) -> dict[str, object] | None:
-        """See `NoInjection`."""
+        """Write and return the record of this fork's fault, or None if it has no fault."""
         return None if self._own is None else self._own.finish()
 
     def depart(self, number: int) -> bool:
-        """Fork the flight for a mission. Return True in the fork."""
+        """Fork the flight for a mission. Return True in the fork and False in the shared flight.
+
+        In the shared flight, the call returns only after the fork has ended.
+        """
         (config, out), begun_s = self._branches[number], time.perf_counter()
         injection = self._injections.pop(number)
         if not self._fork(number):
@@ -175,7 +178,7 @@ class SharedFlight(NoInjection):
         return True
 
     def end(self) -> tuple[MissionConfig, RunFolder]:
-        """Fork the missions that are left. Return the mission and the run folder of this fork.
+        """Fork the missions that are left. In a fork, return its mission and its run folder.
 
         Raises:
             SystemExit: this is the shared flight, which has no mission of its own.
@@ -192,7 +195,7 @@ class SharedFlight(NoInjection):
         return self.config, self.folder
 
     def further(self) -> Iterator[SharedFlight]:
-        """Yield the flights still needed for missions whose fault changed, ended or hung a node."""
+        """Yield the further flights for missions whose fault changed, ended or hung a node."""
         deaths: dict[tuple[object, ...], dict[int, StruckNode]] = {}
         for number, node in self._struck.items():
             how = node.how or f"fault {number}"  # no two faults change a node in the same way
@@ -212,7 +215,10 @@ class SharedFlight(NoInjection):
         return {number: self._branches[number] for number in numbers}
 
     def _strike(self) -> dict[int, StruckNode]:
-        """Inject the instruction-level faults in rehearsals. Return those that are masked."""
+        """Inject the instruction-level faults in rehearsals. Return the nodes that masked theirs.
+
+        They are keyed by mission number. The other nodes are kept for further flights.
+        """
         if self._strike_nodes is None or self.recorder is None or not self.recorder.sequence:
             return {}
         config, _ = next(iter(self._branches.values()))
@@ -240,7 +246,7 @@ class SharedFlight(NoInjection):
 
 
 class _FurtherFlight(SharedFlight):
-    """A repetition of the flight, with nodes that were struck in rehearsals."""
+    """A repetition of the shared flight, with nodes that were struck in rehearsals."""
 
     def __init__(
         self,
@@ -255,11 +261,11 @@ class _FurtherFlight(SharedFlight):
         self.recorder = _Starts(self._lose)
 
     def _lose(self, node: str, order: int) -> None:
-        """Handle the start of a request to a node, given its number, from 1."""
+        """Handle the start of a node's invocation, given its number, from 1."""
 
 
 class _StruckFlight(_FurtherFlight):
-    """A repetition of the flight, up to the last request in which a node was struck."""
+    """A repetition of the shared flight, up to the last request in which a node was struck."""
 
     def _lose(self, node: str, order: int) -> None:
         """Fork the missions whose node was struck in this request.
@@ -281,36 +287,43 @@ class _StruckFlight(_FurtherFlight):
             raise SystemExit
 
     def end(self) -> tuple[MissionConfig, RunFolder]:
-        """See `SharedFlight`. Missions that are left are flown alone."""
+        """Return the mission and run folder of this fork.
+
+        Raises:
+            SystemExit: this is the shared flight. Missions that were not forked are flown alone.
+        """
         if self.config is None:
             raise SystemExit
         return self.config, self.folder
 
 
 class _LostFlight(_FurtherFlight):
-    """A repetition of the flight, with the loss of a node that several faults have in common."""
+    """A repetition of the shared flight that includes the loss of a node.
+
+    Several faults cause this same loss, so their missions share this flight.
+    """
 
     _text = ""  # text of the logged strike
 
     @property
     def _first(self) -> StruckNode:
-        """The fault whose strike the flight logs."""
+        """The first struck node, whose strike the flight logs."""
         return next(iter(self._left.values()))
 
     def _lose(self, node: str, order: int) -> None:
-        """Let the node end in this invocation if the first fault ended it there."""
+        """If this is the invocation in which the faults ended the node, let the node end here."""
         if (self._first.node, self._first.order) == (node, order):
             self.flight.lose_nodes_as(next(iter(self._branches.values()))[0])
             self.flight.isolate_late(node, self._first.process)
 
     def news(self) -> list[str]:
-        """See `NoInjection`. The news is that of the first fault."""
+        """Return the new lines of text about the first fault; none in a fork."""
         news = self._first.news() if self.config is None else []
         self._text = "".join(news) or self._text
         return news
 
     def end(self) -> tuple[MissionConfig, RunFolder]:
-        """See `SharedFlight`. Each fork logs the strike of its own fault."""
+        """Fork all missions, as `SharedFlight.end` does. Each fork logs its own fault's strike."""
         assert self.flight.companion is not None
         executor = self.flight.companion.executor
         executor.settle()  # the forks cannot share the processes of its nodes
@@ -332,20 +345,20 @@ class _LostFlight(_FurtherFlight):
 
 
 class _Starts(Recorder):
-    """Counts the invocations of each node, and reports each one by its number when it starts."""
+    """Counts the invocations of each node, and reports the number of each one when it starts."""
 
     def __init__(self, report: Callable[[str, int], None]) -> None:
         super().__init__()
         self._report, self._counts = report, Counter[str]()
 
     def on_start(self, node: str, value: object, start_s: float) -> None:
-        """Report the start of an invocation by its node and number, from 1."""
+        """Report the start of an invocation: the node, and the invocation's number from 1."""
         self._counts[node] += 1
         self._report(node, self._counts[node])
 
 
 class _ForkedInjection(SourceInjection):
-    """A fault whose first strike forks the shared flight."""
+    """Injection of a source-level fault whose first strike forks the shared flight."""
 
     def __init__(self, config: FaultConfig, shared: SharedFlight, number: int) -> None:
         super().__init__(config)
@@ -361,39 +374,39 @@ class _ForkedInjection(SourceInjection):
 
 
 class _Injectors(NoInjector):
-    """The injectors of the missions that have not been forked; in a fork, only its own."""
+    """The injectors of all missions that have not been forked. In a fork, only its own injector."""
 
     def __init__(self, injections: dict[int, NoInjection]) -> None:
         super().__init__()
         self._injections = injections
 
     def _injectors(self) -> Iterator[NoInjector]:
-        """Yield the remaining injectors. In a fork, stop after the fork's own."""
+        """Yield the injectors of the remaining missions. In a fork, stop after the fork's own."""
         for number in list(self._injections):
             if number in self._injections:
                 yield self._injections[number].injector
 
     def watch(self, moment: Moment) -> None:
-        """See `NoInjector`."""
+        """Have every injector check its trigger at this moment."""
         for injector in self._injectors():
             injector.watch(moment)
 
     def pass_on(self, message: M, moment: Moment) -> M:
-        """See `NoInjector`."""
+        """Return a published message, corrupted if this is a fork whose fault strikes it."""
         for injector in self._injectors():
             with contextlib.suppress(_Struck):
                 message = injector.pass_on(message, moment)
         return message
 
     def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """See `NoInjector`."""
+        """Return the active plan, corrupted if this is a fork whose fault strikes it."""
         for injector in self._injectors():
             with contextlib.suppress(_Struck):
                 trajectory = injector.strike_latched(trajectory, moment, index)
         return trajectory
 
     def strike(self, moment: Moment) -> None:
-        """See `NoInjector`."""
+        """Have every injector strike memory or a process if its fault is due."""
         for injector in self._injectors():
             with contextlib.suppress(_Struck):
                 injector.strike(moment)

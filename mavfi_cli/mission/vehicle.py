@@ -46,7 +46,7 @@ class Vehicle(ABC):
         link: The companion's end of the link.
         truth: The referee's log; None before the end, or if the vehicle died.
         depth: Path of the Unix domain socket that sends depth frames as arrays to a user's
-            companion, if that uses it; None unless mavfi started the vehicle's process.
+            companion that requests it; None unless mavfi started the vehicle's process.
     """
 
     link: Transport
@@ -55,13 +55,13 @@ class Vehicle(ABC):
 
     @staticmethod
     def start(config: MissionConfig) -> Vehicle:
-        """Start the vehicle in this process, or in its own if the flight uses the wall clock."""
+        """Start the vehicle in this process, or in a separate one for flights on the wall clock."""
         by_wall = config.realtime or config.companion is not None
         return (VehicleProcess if by_wall else VehicleInProcess)(config)
 
     @staticmethod
     def start_in_lockstep(config: MissionConfig) -> Vehicle:
-        """Start the vehicle in its own process, in lockstep with a user's companion."""
+        """Start the vehicle in a separate process, in lockstep with a user's companion."""
         return _LockstepProcess(config)
 
     @staticmethod
@@ -69,22 +69,22 @@ class Vehicle(ABC):
         """Return a function that connects to a vehicle that another process runs in lockstep.
 
         Args:
-            url: Endpoint of the link.
-            briefing: File of the vehicle's briefing.
+            url: Endpoint of the link to the vehicle.
+            briefing: File to which the other process has written the vehicle's briefing.
         """
         return lambda _: _VehicleElsewhere(url, briefing)
 
     @abstractmethod
     def briefing(self) -> Briefing:
-        """Return the briefing: start, goal, flight bounds and camera mount.
+        """Return the vehicle's briefing: start, goal, flight bounds and camera mount.
 
         Raises:
-            VehicleProcessError: There is no briefing.
+            VehicleProcessError: The vehicle has written no valid briefing.
         """
 
     @staticmethod
     def read_briefing(path: Path) -> Briefing:
-        """Read a briefing that the vehicle's process has written.
+        """Read the briefing from the file to which the vehicle's process has written it.
 
         Raises:
             VehicleProcessError: The briefing is missing or damaged.
@@ -113,7 +113,7 @@ class Vehicle(ABC):
         deadline_s = time.monotonic() + _START_LIMIT_S
         while not select.select([self.link.fileno()], [], [], _LOOK_S)[0]:
             if interrupts:
-                raise Interrupted("interrupted")
+                raise Interrupted("interrupted before the flight began")
             if time.monotonic() > deadline_s:
                 raise VehicleProcessError(f"the vehicle sent nothing within {_START_LIMIT_S:g} s")
         try:
@@ -125,9 +125,12 @@ class Vehicle(ABC):
 
     @abstractmethod
     def end(self) -> VehicleProcessError | None:
-        """Close the link and set the truth. Return the reason if the vehicle ended earlier.
+        """Close the link, end the vehicle, and set `truth`.
 
-        May be called repeatedly.
+        Safe to call more than once.
+
+        Returns:
+            The error with which the vehicle ended, or None if it ended normally.
         """
 
 
@@ -161,17 +164,17 @@ class VehicleInProcess(Vehicle):
 
     @staticmethod
     def warm_up() -> None:
-        """Load and compile everything that a vehicle in this process needs."""
+        """Load and compile all code that a vehicle in this process needs."""
         from sitl.server import warm_up
 
         warm_up()
 
     def briefing(self) -> Briefing:
-        """See `Vehicle`."""
+        """Return the vehicle's briefing."""
         return _at_flight_levels(self._vehicle.briefing)
 
     def end(self) -> VehicleProcessError | None:
-        """See `Vehicle`."""
+        """End the simulation and set `truth`. Return the error that ended the vehicle, if any."""
         self._vehicle.end()
         self.truth = self._vehicle.truth()
         error = self._vehicle.error
@@ -183,14 +186,14 @@ class VehicleInProcess(Vehicle):
 
 
 def _at_flight_levels(briefing: Briefing) -> Briefing:
-    """Return a briefing whose height bounds are the flight levels, not those of the world."""
+    """Return a copy of the briefing with the flight levels as height bounds, not the world's."""
     bounds = briefing.bounds_enu_m.copy()
     bounds[2::3] = LOWEST_M, HIGHEST_M
     return replace(briefing, bounds_enu_m=bounds)
 
 
 def _read_truth(folder: Path) -> FlightTruth | None:
-    """Read the truth that a vehicle process has written; None if there is none."""
+    """Read the truth that a vehicle process has written. Return None if it has written none."""
     report, host = folder / "truth.json", folder / "host.json"
     if not report.is_file():
         return None
@@ -201,7 +204,7 @@ def _read_truth(folder: Path) -> FlightTruth | None:
 
 
 class VehicleProcess(Vehicle):
-    """A vehicle in its own process, `python -m sitl`. Closing the socket ends the process.
+    """A vehicle in its own process, `python -m sitl`. Closing the link ends the process.
 
     Raises:
         VehicleProcessError: The process cannot be started.
@@ -236,7 +239,7 @@ class VehicleProcess(Vehicle):
 
     @staticmethod
     def _line(config: MissionConfig, descriptor: int) -> list[str]:
-        """Return the module and arguments of the process, given its link's descriptor."""
+        """Return the module to run and its arguments, given the file descriptor of its link."""
         line = ["sitl", *_arguments(config)]
         if config.companion is not None:
             return [*line, "--link", f"onboard=fd:{descriptor}", "--speed", repr(config.speed)]
@@ -246,11 +249,14 @@ class VehicleProcess(Vehicle):
         return [*line, "--speed", "1"] if config.realtime else line
 
     def briefing(self) -> Briefing:
-        """See `Vehicle`."""
+        """Return the briefing that the vehicle's process has written to a file."""
         return self.read_briefing(self._scratch.path / BRIEFING)
 
     def end(self) -> VehicleProcessError | None:
-        """See `Vehicle`; a vehicle that does not end is killed."""
+        """Close the link, wait for the process to end, and set `truth`. Return the error, if any.
+
+        If the process does not end in time, kill it.
+        """
         self.link.close()
         try:
             self._process.wait(_END_LIMIT_S)
@@ -280,7 +286,10 @@ class VehicleProcess(Vehicle):
 
 
 class _LockstepProcess(VehicleProcess):
-    """A vehicle in lockstep with a user's companion. The flight limits the time for an answer."""
+    """A vehicle in lockstep with a user's companion.
+
+    The flight, not the vehicle, limits how long the companion may take to answer a tick.
+    """
 
     @staticmethod
     def _line(config: MissionConfig, descriptor: int) -> list[str]:
@@ -289,7 +298,7 @@ class _LockstepProcess(VehicleProcess):
 
 
 class _VehicleElsewhere(Vehicle):
-    """A vehicle in another process. The arguments are those of `Vehicle.at`.
+    """A vehicle that another process has started. The arguments are those of `Vehicle.at`.
 
     Raises:
         LinkError: The link cannot be opened.
@@ -300,16 +309,16 @@ class _VehicleElsewhere(Vehicle):
         self.link = open_transport(url)
 
     def briefing(self) -> Briefing:
-        """See `Vehicle`."""
+        """Return the briefing that the other process has written to a file."""
         return self.read_briefing(self._briefing)
 
     def end(self) -> None:
-        """Close the link."""
+        """Close the link. The other process sets no truth here."""
         self.link.close()
 
 
 class _EyesProcess(VehicleProcess):
-    """`python -m sitl.camera`: camera, referee and link of a foreign autopilot."""
+    """The process `python -m sitl.camera`: camera, referee and link for a foreign autopilot."""
 
     _name = "camera"
 
@@ -326,7 +335,7 @@ class _EyesProcess(VehicleProcess):
 
 
 def _arguments(config: MissionConfig) -> list[str]:
-    """Return the arguments of `python -m sitl`, except the link and the folder of the truth."""
+    """Return the arguments of `python -m sitl`, except those of the link and the truth's folder."""
     line = _of_the_world(config, "--camera-size", "--camera-rate")
     if config.autopilot != OWN_AUTOPILOT:
         line += ["--hil" if config.autopilot == "px4" else "--json", config.autopilot]
@@ -336,7 +345,7 @@ def _arguments(config: MissionConfig) -> list[str]:
 
 
 def _of_the_world(config: MissionConfig, size: str, rate: str) -> list[str]:
-    """Return the options of world, vehicle and camera."""
+    """Return the command-line options that describe the world, the vehicle and the camera."""
     return [
         "--world", config.world, "--seed", str(config.seed_of_world), "--vehicle", config.vehicle,
         size, f"{config.camera_columns}x{config.camera_rows}", rate, repr(config.camera_rate_hz),
@@ -357,6 +366,9 @@ def other_end(
     config: MissionConfig, launch: StartVehicle = Vehicle.start
 ) -> Iterator[tuple[Transport, Vehicle | None]]:
     """Connect to the mission's foreign autopilot, or start and connect to a simulated vehicle.
+
+    Yield the link and the vehicle, which is None for a foreign autopilot without a camera process.
+    At the end, close the link and end the vehicle.
 
     Raises:
         MavfiError: The link cannot be opened, or the vehicle cannot start.

@@ -31,7 +31,10 @@ _KINDS = {  # kinds of faults: level, and effect on the struck node
 
 
 def judgement_of(judged: JudgedClaim, stack: str, fate: Fate = Fate.ALL) -> Judgement | None:
-    """Return the judgement of a claim on a stack or in isolated kernels; None if there is none."""
+    """Return a claim's judgement on a stack, or in isolated kernels if the claim is about those.
+
+    Return None if the claim was not judged there for faults of this fate.
+    """
     place = ISOLATED if judged.claim.isolated else stack
     return judged.judgements.get(place, {}).get(fate)
 
@@ -50,7 +53,7 @@ def short_name(judged: JudgedClaim) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Family:
-    """The claims of a figure, table or section."""
+    """The claims about one figure, table or section of the paper."""
 
     name: str
     title: str
@@ -63,7 +66,7 @@ class Family:
 
     @classmethod
     def of(cls, claims: Sequence[JudgedClaim]) -> list[Self]:
-        """Group claims by figure, table or section, in order."""
+        """Group consecutive claims about the same figure, table or section."""
         families = []
         for name, members in groupby(claims, lambda judged: judged.claim.item):
             title = f": {BY_NAME[name].title}" if name in BY_NAME else ""
@@ -75,7 +78,7 @@ class Family:
 
 
 def answer(claims: Sequence[JudgedClaim], stack: str) -> str:
-    """Summarise the verdicts on a stack and in the isolated kernels in one sentence."""
+    """Return a sentence on how far a stack and the isolated kernels reproduce the paper."""
     counts = _count_verdicts(claims, stack)
     yes, no, open_ = (
         counts[verdict] for verdict in (Verdict.REPRODUCED, Verdict.CONTRADICTED, Verdict.UNDECIDED)
@@ -94,7 +97,11 @@ def answer(claims: Sequence[JudgedClaim], stack: str) -> str:
 
 
 def crash_sentence(claims: Sequence[JudgedClaim], stack: str, flights: Flights) -> str:
-    """Describe how reproduced claims and lost missions depend on dead nodes; "" without either."""
+    """Return sentences on how reproduced claims and lost missions depend on dead nodes.
+
+    The first counts the reproduced claims that silent faults alone reproduce too, the second the
+    lost missions whose fault ended a node. Each is left out if there are no such claims or losses.
+    """
     parts = []
     pairs = [
         (of_all, silent)
@@ -120,7 +127,7 @@ def crash_sentence(claims: Sequence[JudgedClaim], stack: str, flights: Flights) 
 
 
 def _count_verdicts(claims: Sequence[JudgedClaim], stack: str) -> Counter[Verdict]:
-    """Count the claims by verdict, for a stack or for isolated kernels."""
+    """Count the claims with each verdict, on a stack or in isolated kernels."""
     judgements = (judgement_of(judged, stack) for judged in claims)
     return Counter(judgement.verdict for judgement in judgements if judgement)
 
@@ -134,7 +141,7 @@ def _are(number: int) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disagreement:
-    """Contradicted claims with the same reason.
+    """Claims that are contradicted for the same reason.
 
     Attributes:
         reason: why they are contradicted, in words; empty if no reason is known.
@@ -145,7 +152,7 @@ class Disagreement:
 
     @property
     def names(self) -> Mapping[str, str]:
-        """Short names by claim name; consecutive claims of an item mention the item only once."""
+        """Short names, keyed by claim name. Consecutive claims of an item name it only once."""
         names, item = {}, ""
         for judged in self.claims:
             short, item_before, item = short_name(judged), item, judged.claim.item
@@ -155,7 +162,7 @@ class Disagreement:
 
 
 def disagreements(claims: Sequence[JudgedClaim], stack: str) -> list[Disagreement]:
-    """Group the contradicted claims by reason, in the order of the claims."""
+    """Group the claims that are contradicted on a stack by reason, in the order of the claims."""
     by_reason: dict[str, list[JudgedClaim]] = {}
     for judged in claims:
         judgement = judgement_of(judged, stack)
@@ -168,10 +175,10 @@ def disagreements(claims: Sequence[JudgedClaim], stack: str) -> list[Disagreemen
 
 
 def reason_of(judged: JudgedClaim, stack: str) -> str:
-    """Return why a stack contradicts a claim; empty if it does not, or if no reason is known.
+    """Return the known reason why a claim is contradicted on a stack, or an empty string.
 
     A reason explains one effect, on the paper's stack or in isolated kernels. It is returned only
-    if the effect lies in the interval that the reason explains.
+    if the claim is contradicted and its effect lies in the interval that the reason explains.
     """
     words, low, high = REASONS.get(judged.claim.name, ("", 0.0, 0.0))
     judgement = judgement_of(judged, stack)
@@ -217,7 +224,10 @@ class DetectorBalance:
 
     @classmethod
     def of(cls, stack: str, flights: Flights) -> Iterator[Self]:
-        """Yield a balance for each level, platform, detector and fate that has flown pairs."""
+        """Yield a balance for each level, platform, detector and fate with pairs of flights.
+
+        A pair consists of the flights with the same fault without and with the detector.
+        """
         watched = flights.comparable.chosen(detector=(*DETECTOR_TITLES,), bare_struck=True)
         for level, computer, detector in sorted(
             watched.by("level", "platform", "detector"), key=str
@@ -237,7 +247,7 @@ class DetectorBalance:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Against:
-    """The effect of a protection against a kind of fault.
+    """The effect of a detector, or of another stack, against one kind of fault.
 
     Attributes:
         effect: `helps`, `harms`, `no proven effect` or `nothing to undo`, by a test at LEVEL.
@@ -249,7 +259,7 @@ class _Against:
 
     @classmethod
     def of_pairs(cls, balance: Balance) -> _Against | None:
-        """Judge a protection by McNemar's test on the same faults; None without pairs."""
+        """Judge a detector by McNemar's test on the same faults, or return None without pairs."""
         if not balance.pairs:
             return None
         before, caused, pairs = balance.before, balance.caused, balance.pairs
@@ -262,7 +272,10 @@ class _Against:
 
     @classmethod
     def of_shares(cls, before: Share, after: Share) -> _Against | None:
-        """Judge a protection by the change of the harmed share; None if a share has no missions."""
+        """Judge another stack by the change in the share of harmed missions.
+
+        Return None if there are no missions on one of the stacks.
+        """
         if not (before.total and after.total):
             return None
         change = after.minus(before)
@@ -281,10 +294,10 @@ def _effect(ill: int, better: bool, proven: bool) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Safeguard:
-    """A detector or another stack: its effect against each kind of fault, and its cost.
+    """A detector or another stack, with its effect against each kind of fault and its costs.
 
     Attributes:
-        against: effect by kind of fault; None if that kind was not flown.
+        against: effect, keyed by kind of fault; None if that kind was not flown.
         costs: mean share of the flight time that detection and recovery take, by name of the level;
             empty if not measured.
     """
@@ -295,7 +308,10 @@ class Safeguard:
 
 
 def protections(flights: Mapping[str, Flights]) -> list[Safeguard]:
-    """Compare the detectors on the first stack, and each other stack used instead of the first."""
+    """Judge each detector on the first stack, and each other stack as a substitute for the first.
+
+    Detectors and stacks are omitted if nothing was flown to judge them.
+    """
     (name, first), *others = flights.items()
     safeguards = [
         Safeguard(
@@ -325,7 +341,10 @@ def _costs(flights: Flights, detector: str) -> dict[str, float]:
 
 
 def _harmed(flights: Flights, others: Flights) -> dict[str, Share]:
-    """Return the share of harmed missions by kind of fault, in scenes that both sets contain."""
+    """Return the share of harmed missions in `flights`, keyed by kind of fault.
+
+    Only scenes that `others` contains too are counted. A scene is a world with a mission seed.
+    """
     scenes = {*zip(others["world"], others["seed"], strict=True)}
     mine = flights.struck(platform=_COMPUTER)
     mine = mine.where(scene in scenes for scene in mine.seeds)
@@ -340,13 +359,13 @@ def _harmed(flights: Flights, others: Flights) -> dict[str, Share]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Delays:
-    """Delays caused by the same faults, without and with detectors.
+    """The delays that the same faults cause without a detector and with each detector.
 
     Attributes:
         level: `source` or `instruction`.
-        added_s: added flight time, s, (n,), by detector (None: no detector); infinite for a lost
-            mission.
-        golden_s: mean flight time of the golden flights, s.
+        added_s: added flight times in seconds, sorted, in an array of shape (n,) for each detector;
+            infinite for lost missions. The key None stands for no detector.
+        golden_s: mean flight time of the golden flights, in seconds.
     """
 
     stack: str
@@ -375,7 +394,10 @@ class Delays:
 
 
 def delay_sentence(parts: Sequence[Delays]) -> str:
-    """Describe how many flights are lost or over 1 s late, by detector; "" without detectors."""
+    """Return sentences on how many flights are lost or over 1 s late, with and without detectors.
+
+    The result is empty if nothing was flown with a detector.
+    """
     sentences = []
     for part in parts:
         longer = {name: int((added > 1.0).sum()) for name, added in part.added_s.items()}

@@ -38,13 +38,13 @@ _MEASURES = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelFlow:
-    """The missions with a fault in one kernel, by what the fault did to the kernel.
+    """Losses among missions with a fault in one kernel, by what the fault did to the kernel.
 
     Attributes:
         fates: share of lost missions for each of FATES.
         lost, harmed: shares among all missions with a fault in the kernel.
         silent: share of runs of the isolated kernel that end in SDC; None if it was not run.
-        given_silent: probability that a mission is lost given an SDC in the kernel, with the low
+        given_silent: probability that a mission is lost, given an SDC in the kernel, and the low
             and high end of its interval; None if unknown.
     """
 
@@ -57,10 +57,10 @@ class KernelFlow:
 
 
 def kernel_flows(flights: Flights, alone: Mapping[str, tuple[int, int]]) -> list[KernelFlow]:
-    """Return the flow of each kernel struck by instruction-level faults.
+    """Return what instruction-level faults did to missions, for each kernel that they struck.
 
     Args:
-        alone: number of SDCs and number of faults in each isolated kernel.
+        alone: number of SDCs and number of faults in each isolated kernel, keyed by kernel.
     """
     own = {row["pair"]: row for row in flights.golden.rows("pair", *_MEASURES)}
     hit = flights.struck(level="instruction", own_lost=False).by("struck_kernel")
@@ -92,7 +92,7 @@ def _flow(
 
 
 def _fate_of(flight: Row, own: Row) -> str:
-    """Return the fate of a kernel struck by an instruction-level fault.
+    """Return which of FATES a flight with an instruction-level fault had, given its golden flight.
 
     Repeated missions match byte for byte, so only the fault can make a flight differ from its
     golden flight.
@@ -119,7 +119,7 @@ BIT_CLASSES = tuple(tuple(name for name, _ in kinds) for kinds in _BITS.values()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapCell:
-    """Harmed and lost missions among faults in one bit class of a state, in one phase of flight."""
+    """Shares of harmed and lost missions, for faults in one bit class of a state and one phase."""
 
     state: str
     bits: str
@@ -129,11 +129,11 @@ class MapCell:
 
 
 def state_map(flights: Flights) -> list[MapCell]:
-    """Return a cell for each combination of state, bit class and phase that a fault struck, sorted.
+    """Return a cell for each combination of state, bit class and phase of flight that was struck.
 
-    The cells count source-level faults that were flown without a detector and have a successful
-    golden flight. A fault in several components counts once, for their group and for the highest
-    bit that it flips.
+    The cells are sorted. They count source-level faults that were flown without a detector and have
+    a successful golden flight. A fault in several components counts once, for their group and for
+    the highest bit that it flips.
     """
     hit = flights.struck(level="source", own_lost=False)
     hit = hit.where([bool(x["struck_state"] and any(x["struck_bits"] or ())) for x in hit.rows()])
@@ -161,7 +161,9 @@ def _class(flight: Row) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HourlyFailures:
-    """Failures per flight hour of one kind of fault in one world, by detector; "" means none.
+    """Failures per flight hour of one kind of fault in one world, with and without detectors.
+
+    The mappings have a detector's name as key, or "" for flights without a detector.
 
     Attributes:
         where: the struck site, the kind of corruption, the world, and the computer.
@@ -216,7 +218,7 @@ PLAIN = _WORDS["stacks"][""]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arm:
-    """A stack with or without a detector.
+    """One arm of a campaign: a stack with or without a detector.
 
     Attributes:
         golden: share of lost golden flights.
@@ -276,7 +278,7 @@ _READ = ("stack", "detector", "level", "fault", "fault_target", "activation", "l
 
 
 def _arm_of(flight: Row) -> str:
-    """Return the name of a flight's arm; empty if its stack is not a variant of mavbench."""
+    """Return the name of a flight's arm, or "" if its stack is not a variant of mavbench."""
     base, _, changes = flight["stack"].partition(":")
     if base not in (_BASE, f"{_BASE}-protected"):
         return ""
@@ -289,7 +291,7 @@ def _arm_of(flight: Row) -> str:
 
 
 def _trial_of(flight: Row) -> str:
-    """Return a flight's configuration without _APART as text; it is the same in all arms."""
+    """Return a flight's configuration as text, without the fields that differ between arms."""
     config = json.loads(flight["changes"])
     return canonical({name: value for name, value in config.items() if name not in _APART})
 
@@ -318,8 +320,8 @@ class RestartComparison:
     """Success of a stack in a world on the same faults, with different restart delays.
 
     Attributes:
-        paper: success rates in Table IV for golden flights and for flights with a fault, %; None if
-            it lacks the world.
+        paper: success rates in Table IV, in per cent, for golden flights and for flights with a
+            fault; None if the table lacks the world.
         golden: share of golden flights that succeed.
         success: share of missions with instruction-level faults that succeed, by restart rule.
         lost: share of missions that are lost, by restart rule and fate of the fault.

@@ -46,9 +46,10 @@ def judged(
     """Return all claims with their verdicts, in the order of CLAIMS.
 
     Args:
-        flights: flights by stack.
-        kernels: summaries of the isolated kernels, by name.
-        settled: the missions flown to settle claims, by stack; absent if a stack has none.
+        flights: the flights on each stack, keyed by stack.
+        kernels: summaries of the isolated kernels, keyed by name.
+        settled: for each stack, the record of the missions flown to settle claims; a stack without
+            such missions is omitted.
     """
     settled = settled or {}
     judgements: dict[str, dict[str, dict[Fate, Judgement]]] = {claim.name: {} for claim in CLAIMS}
@@ -107,7 +108,7 @@ def _judge(
 
 
 def excludes(size: float | None, bounds: Interval | None) -> bool:
-    """Return True if the bounds of an effect lie less than `size` from 0."""
+    """Return True if both bounds of an effect are closer to 0 than `size`."""
     return size is not None and bounds is not None and -size < bounds.low and bounds.high < size
 
 
@@ -137,7 +138,7 @@ def _read(path: Path) -> Iterator[Claim]:
 
 
 def _range(entry: dict[str, Any]) -> tuple[float, float, str]:
-    """Remove the range from a claim's entry; return its low and high end, and its rule in words."""
+    """Remove the range from a claim's entry. Return its low and high end, and its rule in words."""
     whole = entry.get("unit", "points") in _WHOLE
     if "size" in entry:
         size = entry.pop("size")
@@ -182,7 +183,11 @@ def _in_the_paper(words: str, counts: Sequence[Count]) -> str:
 
 
 def _spread(counts: Sequence[Count]) -> Interval:
-    """Return a rate, difference, recovered share or difference of losses for 1 to 4 counts."""
+    """Return the interval of the number that a claim's counts give.
+
+    One count gives a rate, two a difference of rates, three the share of losses that a protection
+    recovers, and four a difference of two losses.
+    """
     if len(counts) == 3:
         return recovered_share(*counts)
     first, *others = (wilson(*count) for count in counts)

@@ -79,7 +79,12 @@ Step = Callable[[str], object]  # called with the name of each step
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _StateMatrix:
-    """The state map of a phase: states as rows, bit classes as columns; None where empty."""
+    """The state map of one flight phase, with states as rows and bit classes as columns.
+
+    Attributes:
+        columns: names of the bit classes.
+        rows: for each state, its cell in every column; None if no fault struck there.
+    """
 
     stack: str
     phase: str
@@ -92,7 +97,7 @@ class _ItemPart:
     """The part of an item that comes from one stack, the isolated kernels or the model.
 
     Attributes:
-        picture: None if it needs run folders that do not exist.
+        picture: the item's figure; None if it needs run folders that do not exist.
     """
 
     place: str
@@ -102,7 +107,7 @@ class _ItemPart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _ShownItem:
-    """An item of the paper with its parts, and the names of the sources that provide none."""
+    """An item of the paper on the page: its parts, and the names of the sources without a part."""
 
     item: Item
     parts: Sequence[_ItemPart]
@@ -111,7 +116,7 @@ class _ShownItem:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _ListedMission:
-    """A mission that deserves a closer look.
+    """A lost or unusually long mission that the page lists.
 
     Attributes:
         ratio: flight time divided by that of the golden flight; None if the mission is lost.
@@ -140,7 +145,7 @@ class _CampaignMissions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Document:
-    """The content of the page. It shows `stack` first and collapses the other stacks."""
+    """The content of the results page, which shows `stack` first and collapses other stacks."""
 
     version: str
     stacks: Sequence[str]
@@ -180,11 +185,11 @@ class Document:
         return self.stacks[0]
 
     def reason(self, judged: JudgedClaim) -> str:
-        """Return why a claim is contradicted; empty if it is not, or if no reason is known."""
+        """Return the known reason why a claim is contradicted on `stack`, or an empty string."""
         return reason_of(judged, self.stack)
 
     def verdicts(self) -> dict[str, dict[str, int]]:
-        """Count the claims with each verdict, by stack and for isolated kernels."""
+        """Return the number of claims per verdict, keyed by stack or ISOLATED, then by verdict."""
         by_place = {
             place: [claim.verdict(place) for claim in self.claims] for place in (*STACKS, ISOLATED)
         }
@@ -195,10 +200,11 @@ class Document:
 
 
 def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str) -> Document:
-    """Compute the content of the page.
+    """Compute the content of the results page from the campaigns and kernel summaries.
 
     Args:
         upsets_per_hour: bit flips that reach the injection sites per flight hour.
+        step: called with the name of each step when it begins.
     """
     flown = {stack: evidence.flights(stack) for stack in STACKS}
     stacks = sorted(STACKS, key=lambda stack: not len(flown[stack]))
@@ -256,7 +262,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
 
 
 def _advice(guards: Sequence[Safeguard]) -> str:
-    """Advise a designer: write one sentence for each kind of fault that did harm."""
+    """Return advice for a designer, with one sentence for each kind of fault that did harm."""
     sentences = []
     for kind in guards[0].against if guards else ():
         effects = {guard.name: cell.effect for guard in guards if (cell := guard.against[kind])}
@@ -434,7 +440,10 @@ def _missions(campaigns: Sequence[CampaignSource]) -> Iterator[_CampaignMissions
 def _listed(
     flight: Mapping[str, Any], source: CampaignSource, pictured: bool = False
 ) -> _ListedMission:
-    """Describe a mission. Its command shortens the absolute path of an export to the file name."""
+    """Return the page's entry for a mission.
+
+    In the command, the absolute path of an export is shortened to the file name.
+    """
     struck_state = f"{flight['fault_target']}, {flight['fault_field'] or 'any'}"
     fault = "golden" if flight["level"] is None else struck_state
     kept = source.may_have_runs and _is_kept(flight["path"])
@@ -454,7 +463,7 @@ def _listed(
 
 
 def _flight_picture(run: Path) -> str:
-    """Return a run's top view as a data URL; "" if it is missing, a link or too large.
+    """Return a run's top view as a data URL, or "" if the file is missing, a link or too large.
 
     A browser runs no scripts in an image that it loads from a data URL.
     """
@@ -521,7 +530,10 @@ def _item_picture(item: Item, place: str, figure: Figure, csv: str) -> Picture:
 
 
 def _with_runs(item: Item, stack: str, evidence: Evidence) -> Flights | None:
-    """Return an item's flights from the first campaign that kept all their run folders, or None."""
+    """Return an item's flights from the first campaign that kept all their run folders.
+
+    Return None if no campaign kept them all.
+    """
     folders = [source for source in evidence.campaigns if source.may_have_runs]
     several = (Flights.pooled([source.flights], stack) for source in folders)
     own = (of_kind(item, stack, flights) for flights in several)
@@ -533,7 +545,10 @@ def _is_kept(run: str | None) -> bool:
 
 
 def _over_own(flights: Flights) -> Iterator[dict[str, Any]]:
-    """Yield a row for each successful faulty flight: the settings that vary, and the time ratio."""
+    """Yield a row for each faulty flight that succeeds, if its golden flight does so too.
+
+    A row has the settings that differ between these flights, and the ratio of the flight times.
+    """
     rows = flights.timed.rows(*_SETTING)
     varying = [name for name in _SETTING if len({row[name] for row in rows}) > 1]
     for row, ratio in zip(rows, flights.timed.ratios, strict=True):

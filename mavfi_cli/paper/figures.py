@@ -34,7 +34,7 @@ _Row = tuple[
 ]  # label, detector, flights, the paper's longest
 _Drawing = Callable[[Flights, str], "Figure"]
 _STYLES = {None: 1, "gad": 2, "aad": 3}  # index into the palette, by detector
-_NOTHING = "nothing to draw: no mission of the figure has flown yet"
+_NOTHING = "cannot draw the figure, because none of its missions has flown yet"
 
 
 def draw(table: PaperTable, flights: Flights | None, columns: str) -> Figure:
@@ -56,7 +56,10 @@ def draw(table: PaperTable, flights: Flights | None, columns: str) -> Figure:
 
 
 def panel(rows: Iterable[_Row]) -> list[Strip]:
-    """Return a strip for each row, with the increases in flight time over golden flights, %."""
+    """Return a strip for each row, with the increases in its flight times in per cent.
+
+    An increase is relative to the golden flight of the same mission.
+    """
     return [
         Strip(label=label, values=flights.increases, style=_STYLES[detector], paper=paper)
         for label, detector, flights, paper in rows
@@ -114,7 +117,10 @@ def _fig12(flights: Flights) -> dict[str, list[_Row]]:
 
 
 def _fig14(flights: Flights) -> dict[str, list[_Row]]:
-    """Build a panel per world, with the part of the paper's worst increase left unrecovered."""
+    """Return the rows of each world's panel, keyed by world.
+
+    The paper's number in a row is the part of its worst increase that is not recovered.
+    """
     panels: dict[str, list[_Row]] = {}
     for world in flights.worlds:
         here = flights.chosen(world=world)
@@ -154,7 +160,7 @@ def _fig13(flights: Flights, columns: str) -> Figure:
     """Draw the top view of the pair whose flight time grows most."""
     kept = [Path(path) for path in flights["path"] if path]
     if not kept:
-        raise RecordError("fig13 needs run folders, but none were kept (fly with --keep all)")
+        raise RecordError("fig13 requires run folders, but none were kept; fly with --keep all")
     with Ledger(kept[0].parents[1]) as ledger:
         flown = Trajectories.of(pair(ledger, among=frozenset(flights["number"])))
     figure = flown.draw(across=1 if columns == "one" else 2)

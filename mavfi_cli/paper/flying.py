@@ -34,11 +34,11 @@ _PROFILES_BYTES = 10_000_000  # profiles of one golden flight
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Forecast:
-    """The missions and kernel runs left to do, and their time and disk space on this machine.
+    """The missions and kernel runs that are left, and the time and disk space that they will need.
 
     Attributes:
         missions, over: number of missions of the items, and how many of them are finished.
-        seconds: wall time of the rest, s; excludes missions if none has been measured.
+        seconds: wall time of the rest, in seconds; excludes missions if none has been measured.
         disk_bytes: disk space for the rest, including profiles that are removed later.
         measured: number of missions on which the forecast is based; may be 0 if few are left.
         jobs: number of concurrent missions or runs.
@@ -114,7 +114,7 @@ def reproduce(
 
 
 class _Ahead(Spectator):
-    """Forwards events of the missions, and adds the time of the kernel runs to the time left."""
+    """Forwards the events of missions, and adds the time of later kernel runs to the time left."""
 
     def __init__(self, spectator: Spectator, beyond_s: float) -> None:
         self._spectator, self._beyond_s = spectator, beyond_s
@@ -156,18 +156,18 @@ def _require_same(plan: FlightsPlan, stored: FlightsPlan | None) -> None:
     if stored is None:
         problem = "holds a campaign that is not a reproduction"
     elif stored.stack != plan.stack:
-        problem = f"flies the stack {stored.stack}, not {plan.stack}"
+        problem = f"holds a reproduction on the stack {stored.stack}, not {plan.stack}"
     elif stored.worlds != plan.worlds:
-        problem = f"was begun with --worlds {stored.worlds}"
+        problem = f"holds a reproduction with --worlds {stored.worlds}, not {plan.worlds}"
     elif plan.scale < stored.scale:
-        problem = f"was begun at --scale {stored.scale:g}, which cannot shrink to {plan.scale:g}"
+        problem = f"was begun with --scale {stored.scale:g}, which cannot shrink to {plan.scale:g}"
     else:
         return
     raise ConfigError(f"{problem}; choose another --out", path=plan.folder)
 
 
 def _missing(ledger: Ledger, wanted: frozenset[int]) -> dict[int, str]:
-    """Return the kind of each wanted mission that has no result, by mission number."""
+    """Return the kind of each wanted mission that has no result, keyed by mission number."""
     return {
         mission.number: _kind(mission.config.instruction, mission.config.fault)
         for mission in ledger.missing()
@@ -178,10 +178,13 @@ def _missing(ledger: Ledger, wanted: frozenset[int]) -> dict[int, str]:
 def _measured(
     ledger: Ledger, wanted: frozenset[int], options: Options, spectator: Spectator
 ) -> list[int]:
-    """Fly a few missions of each kind with few results; return the missions to forecast from.
+    """Fly a few missions of each kind that has few results, so that their times can be forecast.
 
     Some missions are flown first and not measured, because they also fly golden flights that later
     missions share.
+
+    Returns:
+        Numbers of the finished missions on which the forecast should be based.
     """
     missing = _missing(ledger, wanted)
     over = sorted(wanted.difference(missing))[-_NEWEST:]
@@ -212,16 +215,16 @@ def _kind(instruction: object, fault: object) -> str:
 
 
 def _kinds(results: Iterable[MissionResult]) -> list[tuple[str, float]]:
-    """Return the kind and wall time of finished missions."""
+    """Return the kind, and the wall time in seconds, of each finished mission."""
     configs = [(result.mission.config, result.wall_s) for result in results]
     return [(_kind(config.instruction, config.fault), wall_s) for config, wall_s in configs]
 
 
 def remaining_s(measured: Iterable[tuple[str, float]], missing: Mapping[str, int]) -> float:
-    """Estimate the wall time of flying the missing missions one after another, s.
+    """Estimate the wall time, in seconds, of flying the missing missions one after another.
 
     Args:
-        measured: kind and wall time, s, of each finished mission.
+        measured: kind, and wall time in seconds, of each finished mission.
         missing: number of missing missions of each kind. Each takes the mean time of its kind,
             or of all measured missions if its kind was not measured.
     """
@@ -265,7 +268,7 @@ def _with_flights(
 
 
 def _mean_size(parent: Path, unknown: float) -> float:
-    """Return the mean size of up to 20 subfolders of `parent`, bytes; `unknown` if it has none."""
+    """Return the mean size in bytes of up to 20 subfolders of `parent`; `unknown` without any."""
     folders = sorted(path for path in parent.glob("*") if path.is_dir())[-20:]
     files = (path for folder in folders for path in folder.rglob("*") if path.is_file())
     return sum(path.stat().st_size for path in files) / len(folders) if folders else unknown
@@ -295,7 +298,7 @@ _RECORD_BYTES = 2000  # record of one run
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _KernelRuns:
-    """The runs of all kernels in the folder of a reproduction.
+    """The runs of all isolated kernels that a reproduction needs.
 
     Attributes:
         out: folder of all stacks; its subfolder KERNELS_FOLDER holds the runs.
@@ -313,7 +316,7 @@ class _KernelRuns:
         return self.out / KERNELS_FOLDER
 
     def missing(self) -> int:
-        """Count the runs that the stored summary lacks, over all kernels."""
+        """Return the number of runs, over all kernels, that the stored summary lacks."""
         path = self.folder / KERNELS
         if not path.is_file():
             return self.runs * len(select(()))
@@ -321,7 +324,7 @@ class _KernelRuns:
         return sum(max(0, self.runs - done.get(name, 0)) for name in select(()))
 
     def forecast_s(self) -> float:
-        """Estimate the wall time of the missing runs, s, by timing the quickest kernel."""
+        """Estimate the wall time of the missing runs, in seconds, by timing the quickest kernel."""
         with ScratchFolder("kernels") as scratch:
             targets = _targets([_QUICKEST], scratch)
             (measured,) = run_campaign(Plan(runs=_QUICK_RUNS, seed=_SEED), targets)

@@ -32,7 +32,7 @@ _ROMAN = ("", "I", "II", "III", "IV", "V", "VI", "VII")
 
 
 class Source(Enum):
-    """The source from which an item is computed."""
+    """The source of the numbers in an item."""
 
     FLIGHTS = "flights"
     KERNELS = "kernels"  # runs of isolated kernels
@@ -61,13 +61,17 @@ class Item:
 
     @property
     def paper(self) -> str:
-        """The paper's name for the item."""
+        """The paper's name for the item, such as `Fig. 6`."""
         return printed_name(self.name)
 
     def table(
         self, rows: Sequence[PaperRow], worlds: Sequence[str] = (), notes: Sequence[str] = ()
     ) -> PaperTable:
-        """Return the item's table with the given rows and additional notes."""
+        """Return the item's table with the given rows and additional notes.
+
+        Args:
+            worlds: a column without a title is repeated for each world, with its name as title.
+        """
         return PaperTable(
             name=self.name,
             title=f"{self.paper}: {self.title}",
@@ -89,7 +93,11 @@ def printed_name(name: str) -> str:
 
 
 def printed(item: str, *keys: object) -> Printed:
-    """Return a number or text that the paper prints; None if it prints nothing there."""
+    """Return the number or text that the paper prints, or None if it prints nothing there.
+
+    Args:
+        keys: keys of the nested tables of the item in paper.toml.
+    """
     entry: Any = _PAPER.get(item, {})
     for key in keys:
         entry = entry.get(str(key)) if isinstance(entry, Mapping) else None
@@ -119,7 +127,7 @@ LEFT_OUT: Mapping[str, str] = _PAPER["left_out"]
 
 
 def items_named(names: Sequence[str]) -> tuple[Item, ...]:
-    """Return the named items, in the order of ITEMS; without names, return all.
+    """Return the named items in the order of ITEMS, or all items if no names are given.
 
     Raises:
         UnknownName: no item has this name. The message suggests the nearest name.
@@ -138,7 +146,7 @@ def items_named(names: Sequence[str]) -> tuple[Item, ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightsPlan:
-    """The flights of some items on one stack.
+    """The flights that a set of the paper's items needs on one stack.
 
     Methods that take items apply to all items of the plan if none are given.
 
@@ -156,7 +164,10 @@ class FlightsPlan:
 
     @classmethod
     def stored(cls, ledger: Ledger) -> FlightsPlan | None:
-        """Return the stored plan of a reproduction, with all items; None for any other campaign."""
+        """Return the plan of a reproduction, as stored in its ledger, for all items.
+
+        Return None for any other campaign.
+        """
         text = ledger.meta(_META)
         if text is None:
             return None
@@ -165,12 +176,12 @@ class FlightsPlan:
 
     @property
     def folder(self) -> Path:
-        """The folder of the flights."""
+        """The folder of the campaign with these flights."""
         return self.out / folder_name(self.stack)
 
     @property
     def meta(self) -> dict[str, str]:
-        """The part of the plan that the ledger of the flights stores."""
+        """The metadata that the campaign's ledger stores about the plan."""
         stored = {"stack": self.stack, "scale": self.scale, "worlds": self.worlds}
         return {"name": self.folder.name, _META: json.dumps(stored)}
 
@@ -203,7 +214,7 @@ class FlightsPlan:
         return [mission for spec in self._specs(items, 1.0) for mission in spec.kinds()]
 
     def numbered(self, item: Item, first: int, end: int) -> list[tuple[PlannedMission, int]]:
-        """List an item's missions and their repetitions, for repetitions `first` to `end` - 1."""
+        """Return an item's missions in repetitions `first` to `end` - 1, with their repetitions."""
         specs = (spec.scaled(end / spec.repetitions) for spec in self._specs([item], 1.0))
         missions = ((mission, mission.config.seed - spec.first_seed)
                     for spec in specs for mission in spec.missions())  # fmt: skip
@@ -218,7 +229,7 @@ class FlightsPlan:
         return _numbers_of(ledger, self.keys(*items))
 
     def kept(self, ledger: Ledger) -> list[int]:
-        """Return the numbers of the missions whose run folders an item of ITEMS needs."""
+        """Return the numbers of the missions whose run folders must be kept for an item."""
         specs = (spec for spec in self._specs(ITEMS, self.scale) if spec.keep is Keep.ALL)
         return _numbers_of(
             ledger, (key_of(mission) for spec in specs for mission in spec.missions())

@@ -1,4 +1,4 @@
-"""Layouts, which turn the missions of each flown item into the rows of the paper's table.
+"""Turns the missions of each flown item into the rows of the paper's table, by a layout per item.
 
 A layout reads only the configurations and records of the item's missions, not the labels of their
 settings, so it works for any campaign with such missions. It yields the rows; paper.toml contains
@@ -31,9 +31,10 @@ _NOTHING = "nothing flown yet"
 
 
 def of_flights(name: str, flights: Flights) -> PaperTable:
-    """Return the table of an item whose source is FLIGHTS.
+    """Return the table of an item, computed from its flights.
 
     Args:
+        name: name of an item whose source is FLIGHTS.
         flights: the item's missions.
     """
     if name in _ONLY_COMPARABLE:
@@ -72,7 +73,7 @@ _ONLY_COMPARABLE = ("fig12", "table4", "table5")  # exclude partly protected fli
 
 
 def _unpaired(flights: Flights) -> list[str]:
-    """Count the faulty flights whose effect is unknown because no golden flight exists."""
+    """Return a note on the number of faulty flights without a golden flight, or an empty list."""
     struck = flights.where(level is not None for level in flights["level"])
     alone = list(struck["own_lost"]).count(None)
     if not alone:
@@ -119,7 +120,10 @@ def _fig7(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _by_value(name: str, column: str) -> Callable[[Flights], Iterator[PaperRow]]:
-    """Return a layout with a row per value of a column, and whether the paper calls it critical."""
+    """Return a layout that yields a row for the golden flights, and one per value of `column`.
+
+    The rows also state whether the paper calls the value critical.
+    """
 
     def rows(flights: Flights) -> Iterator[PaperRow]:
         yield _row(_GOLDEN, "", cells=_effects(flights.golden))
@@ -139,7 +143,7 @@ _QUALITY = {  # the paper's name of a measure: our column, and its scale
 
 
 def _table3(flights: Flights) -> Iterator[PaperRow]:
-    """Yield the quality of flight for each number of flipped bits."""
+    """Yield a row with the quality of flight for each number of flipped bits."""
     groups = {0: flights.golden}
     faults = flights.faulty().by("fault_bits")
     groups |= {bits: faults[bits,] for (bits,) in sorted(faults)}
@@ -156,7 +160,7 @@ def _table3(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _table4(flights: Flights) -> Iterator[PaperRow]:
-    """Yield the success in each world: golden, with faults, and with faults and each detector."""
+    """Yield rows with the success rate in each world: golden, with faults, and per detector."""
     settings = [(_GOLDEN, "golden", flights.golden), ("injection", "none", flights.faulty())]
     settings += [(f"{title}-based", x, flights.faulty(x)) for x, title in DETECTOR_TITLES.items()]
     for title, key, those in settings:
@@ -168,7 +172,7 @@ def _table4(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _fig12(flights: Flights) -> Iterator[PaperRow]:
-    """Yield each world's worst increase in flight time, and the points each detector recovers."""
+    """Yield each world's worst increase in flight time, and how much each detector recovers."""
     for world in flights.worlds:
         here = flights.chosen(world=world)
         bare, struck = here.golden, here.faulty()
@@ -189,7 +193,10 @@ def _recovered(flights: Flights, item: str, unit: str, place: str) -> Iterator[P
 
 
 def _fig14(flights: Flights) -> Iterator[PaperRow]:
-    """Yield the share of the worst increase that each detector recovers, by protected stages."""
+    """Yield how much of the worst increase in flight time each detector recovers, in per cent.
+
+    There is a row for each detector and each set of protected stages.
+    """
     for detector, title in DETECTOR_TITLES.items():
         for stages in PROTECTED:
             paper = ("fig14", "recovered_percent", detector)
@@ -205,7 +212,7 @@ def _fig14(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _table5(flights: Flights) -> Iterator[PaperRow]:
-    """Yield the shares of the flight time that detection and recovery take."""
+    """Yield the shares of the flight time that each detector and its recoveries take."""
     for detector in DETECTOR_TITLES:
         for title, (columns, keys) in _parts(detector).items():
             cells = (
@@ -219,7 +226,7 @@ def _table5(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _unknown_costs(flights: Flights) -> list[str]:
-    """Return a note if there are flights with a detector but no costs; otherwise nothing."""
+    """Return a note if the costs of flights with a detector are unknown, or an empty list."""
     watched = any(flights["detector"])
     if not watched or len(flights.known("check_share")):
         return []
@@ -248,9 +255,10 @@ SHOWN_STATES = ("waypoint_x", "waypoint_vx", "waypoint_ax")
 
 
 def values_and_deltas(flights: Flights) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Return SHOWN_STATES at all control ticks, and their changes from tick to tick, by state.
+    """Return the values of SHOWN_STATES at all control ticks, and their changes between ticks.
 
-    They come from the traces of the successful flights whose run folders exist.
+    They come from the traces of the successful flights whose run folders exist. The result is keyed
+    by state.
     """
     runs = [Path(path) for path in flights.chosen(lost=False)["path"] if path]
     traces = [read_parquet(run / TRACE, "trace") for run in runs if (run / TRACE).is_file()]
@@ -276,7 +284,7 @@ def _fig11(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _span(values: FloatArray, share: float) -> float:
-    """Return the range of the middle `share` of the values; NaN without values."""
+    """Return the range of the middle `share` of the values, or NaN if there are no values."""
     if not len(values):
         return math.nan
     low, high = np.quantile(values, (0.5 - share / 2.0, 0.5 + share / 2.0))
@@ -298,7 +306,11 @@ def _fig13(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _with(struck: Flights, protected: Flights) -> FloatArray:
-    """Return the increase with protection, %, for the worst unprotected fault, (1,) or (0,)."""
+    """Return the increase in flight time, in per cent, that protection leaves of the worst fault.
+
+    The worst fault is that with the longest flight in `struck`. The array has shape (1,), or (0,)
+    if there is no successful protected flight with this fault.
+    """
     if not len(struck.ratios):
         return np.zeros(0)
     pair, fault = struck.faults[int(np.nanargmax(struck.numbers("over_own")))]
@@ -403,7 +415,7 @@ def _success(flights: Flights, paper: Printed = None) -> PaperCell:
 
 
 def _mean(flights: Flights, name: str, paper: Printed = None, scale: float = 1.0) -> PaperCell:
-    """Average a measure over the successful missions."""
+    """Return a cell with the mean of a measure over the successful missions."""
     return PaperCell.of_mean(scale * _of_successes(flights, name), paper)
 
 
@@ -418,7 +430,7 @@ def _maximum(values: FloatArray, paper: Printed = None) -> PaperCell:
 
 
 def _worst_mean(bare: Flights, flights: Flights, paper: Printed = None) -> PaperCell:
-    """Return the increase from the mean golden to the longest flight time, in per cent."""
+    """Return a cell with the longest flight time over the mean golden one, as an increase in %."""
     golden_s, times_s = (_of_successes(those, "flight_time_s") for those in (bare, flights))
     if not (len(golden_s) and len(times_s)):
         return PaperCell(paper=paper)
@@ -427,7 +439,7 @@ def _worst_mean(bare: Flights, flights: Flights, paper: Printed = None) -> Paper
 
 
 def _recovery(protected: Flights, measure: str, paper: Printed) -> PaperCell:
-    """Return the part of the worst case that a protection recovers, in per cent or in points.
+    """Return a cell with how much of the worst case a protection recovers, in per cent or points.
 
     Args:
         measure: name of an attribute of `WorstCase`.

@@ -85,7 +85,10 @@ def _golden_success(flights: Flights, **where: Any) -> Finding:
 
 
 def _delta_range(flights: Flights, state: str, why: str) -> Finding:
-    """Average 1 - (range of a state's deltas / range of its values) over the golden flights.
+    """Return how much narrower the range of a state's changes is than the range of its values.
+
+    This is 1 - (range of the changes between ticks / range of the values), averaged over the
+    successful golden flights.
 
     Args:
         state: column of the trace.
@@ -135,7 +138,7 @@ def _harm_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
 
 
 def _harmful(flights: Flights, **where: Any) -> Finding:
-    """Return the share of harmful faults."""
+    """Return the share of faults that harm their mission."""
     return _of_share(_clustered(flights.struck(**where), "harmed"), "harmful")
 
 
@@ -163,7 +166,11 @@ def _longer(flights: Flights, **where: Any) -> Finding:
 
 
 def _longer_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
-    """Return the share of successes above LONGER in the first of two groups minus the second's."""
+    """Return the share of long flights in the first of two groups minus that in the second.
+
+    Only faulty flights that succeed like their golden flights count. A flight is long if it takes
+    more than LONGER times as long as its golden flight.
+    """
     timed = {name: flights.struck(**where).timed for name, where in groups.items()}
     return _harm_gap(timed, "over 10 % longer")
 
@@ -201,7 +208,12 @@ def _not_measured(_: Flights, why: str) -> Finding:
 
 
 def _net(seen: Flights, column: str, what: str) -> Finding:
-    """Return (harm undone - harm caused) / harm without the detector, on the same faults."""
+    """Return (harm undone - harm caused) / harm without the detector, on the same faults.
+
+    Args:
+        column: the kind of harm, `harmed` or `lost`.
+        what: words for the missions with this harm.
+    """
     seen = seen.where(value is not None for value in seen[f"bare_{column}"])
     seen = seen.where(value is not None for value in seen[column])
     if not len(seen):
@@ -229,7 +241,7 @@ def _shortened(flights: Flights, detector: str, **where: Any) -> Finding:
 def _undone_difference(
     flights: Flights, detector: str, first: str, others: Sequence[str], **where: Any
 ) -> Finding:
-    """Return the net share of harm undone by watching `first` minus the largest among `others`.
+    """Return the net share of harm undone if `first` is watched, minus the largest of `others`.
 
     Args:
         first, others: sets of stages that the detector watches, each joined by `+`.
@@ -290,7 +302,11 @@ _NO_COSTS = Finding(why="this export does not hold these times; a new one does")
 def _overhead_of(
     flights: Flights, detector: str, parts: Collection[str] = COSTS, **where: Any
 ) -> Finding:
-    """Return the mean share of the flight time that parts of detection and recovery take."""
+    """Return the mean share of the flight time that `parts` of detection and recovery take.
+
+    Args:
+        parts: columns of COSTS, whose sum is averaged.
+    """
     seen, shares = _overheads(flights, detector, parts, where)
     return _costs(seen, shares, f"{len(seen):,} flights")
 
@@ -308,7 +324,10 @@ def _gaussian_dearer(flights: Flights, **where: Any) -> Finding:
 def _overheads(
     flights: Flights, detector: str, parts: Collection[str], where: Where
 ) -> tuple[Flights, FloatArray]:
-    """Return the flights with a detector, and the share of time the parts take in each, or NaN."""
+    """Return the flights that ran the detector, and the share of time that `parts` took in each.
+
+    The shares are an array of shape (n,), with NaN for a flight whose export lacks them.
+    """
     seen = flights.struck(detector=detector, protect=EVERY_STAGE, **where)
     return seen, np.sum([seen.numbers(name) for name in parts], axis=0)
 
@@ -324,10 +343,10 @@ def _costs(seen: Flights, costs: Sequence[float] | FloatArray, counts: str) -> F
 def _outcome_beside(
     kernels: Kernels, kernel: str, outcome: str, extreme: str, others: Sequence[str] = ()
 ) -> Finding:
-    """Return the share of an outcome in a kernel minus that in the most extreme other kernel.
+    """Return the share of an outcome in a kernel minus the largest or smallest in other kernels.
 
     Args:
-        extreme: `most` or `least`.
+        extreme: `most` for the largest share among the other kernels, `least` for the smallest.
         others: names of the other kernels; empty means all.
     """
     there = [name for name in others or kernels if name in kernels and name != kernel]
@@ -358,10 +377,10 @@ def _benign(kernels: Kernels, kernel: str) -> Finding:
 
 
 def _ranking(flights: Flights, kernels: Kernels, **where: Any) -> Finding:
-    """Correlate the SDC of isolated kernels with the harm of their faults in flight (Spearman).
+    """Return the rank correlation of kernels' SDC rates in isolation with their harm in flight.
 
-    The kernels are fixed, not drawn, so the interval covers only the shares: each is drawn from its
-    posterior distribution under Jeffreys' prior.
+    The correlation is Spearman's. The kernels are fixed, not drawn, so the interval covers only the
+    shares: each is drawn from its posterior distribution under Jeffreys' prior.
     """
     flown = {
         name: _clustered(those, "harmed")
@@ -393,7 +412,10 @@ def _posterior(share: Share, rng: np.random.Generator) -> FloatArray:
 
 
 def _spearman(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Correlate the ranks in each column of two arrays, (kernels, n); ties get mean ranks."""
+    """Return Spearman's correlation of each column of two arrays of shape (kernels, n).
+
+    The result has shape (n,). Ties get mean ranks.
+    """
     from scipy.stats import rankdata
 
     ranks = [rankdata(values, axis=0) for values in (first, second)]

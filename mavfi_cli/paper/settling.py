@@ -41,9 +41,9 @@ class _OpenClaim:
     Attributes:
         judgement: its judgement at the last look.
         kinds: kinds of missions on which its effect depends.
-        missions, seconds: number of further missions that would decide it if its effect stayed the
-            same, and their wall time, s; infinite if no number would.
-        repetition_s: wall time of one more repetition of missions of these kinds, s.
+        missions, seconds: number of further missions that would decide the claim if its effect
+            stayed the same, and their wall time in seconds; infinite if no number would decide it.
+        repetition_s: wall time of one more repetition of missions of these kinds, in seconds.
     """
 
     claim: Claim
@@ -65,16 +65,21 @@ class _OpenClaim:
 
 
 def require_settleable(plan: FlightsPlan) -> None:
-    """Check that missions can be added to a plan.
+    """Check that missions can be added to the campaign of a plan.
 
     Raises:
         ConfigError: no item of the plan flies missions, or the plan's path is an export.
     """
     if plan.out.suffix == ".parquet" or plan.folder.is_file():
-        raise ConfigError("is an export, so no missions can be added", path=plan.out)
+        raise ConfigError(
+            "cannot add missions to an export; use the folder of the reproduction", path=plan.out
+        )
     if not any(item.source is Source.FLIGHTS for item in plan.items):
         names = ", ".join(item.name for item in plan.items)
-        raise ConfigError(f"needs an item that flies missions, but got only {names}", key="settle")
+        raise ConfigError(
+            f"at least one of the selected items must fly missions, but got only {names}",
+            key="settle",
+        )
 
 
 def settle(
@@ -89,7 +94,7 @@ def settle(
     Args:
         plan: a plan whose missions have been flown.
         ledger: the plan's ledger, open for writing.
-        hours: limit on the wall time, h; None means no limit.
+        hours: limit on the wall time, in hours; None means no limit.
 
     Returns:
         A line for each claim that was decided by added missions, with its verdict, and one for each
@@ -164,7 +169,7 @@ class _Look:
         self._kernels = {kernel.name: kernel for kernel in summary}
 
     def first(self, ledger: Ledger) -> dict[str, dict[str, FirstLook]]:
-        """Return the first look at every claim with an effect, by name of the claim and fate."""
+        """Return the first look at every claim that has an effect, keyed by claim name and fate."""
         stack = self._plan.stack
         return {
             entry.claim.name: {
@@ -184,7 +189,10 @@ class _Look:
         return whole.chosen(stack=self._plan.stack, as_paper=True, at=(None, "random"))
 
     def open_claims(self, ledger: Ledger, settling: Settling) -> list[_OpenClaim]:
-        """Judge the claims; return the items' undecided claims that more missions may decide."""
+        """Judge all claims again. Return those of the plan's items that are undecided.
+
+        Claims of items that fly no missions are left out.
+        """
         stack = self._plan.stack
         table = flights(ledger)
         flown = self._flown(table)
@@ -264,7 +272,7 @@ def _fly(
     options: Options,
     spectator: Spectator,
 ) -> int:
-    """Fly further repetitions of a claim's missions; return the number of these missions."""
+    """Fly further repetitions of a claim's missions, and return the number of their missions."""
     over = {number for number, _ in ledger.fates()}
     flown = {changes for number, _, _, changes in ledger.rows() if number in over}
     first = _first_missing(plan, entry, flown)
@@ -281,7 +289,7 @@ def _fly(
 
 
 def _first_missing(plan: FlightsPlan, entry: _OpenClaim, flown: Collection[str]) -> int:
-    """Return the first repetition in which a mission of the claim is missing; at most _MOST."""
+    """Return the first repetition that lacks a mission of the claim, or _MOST if there is none."""
     item = BY_NAME[entry.claim.item]
     for first in range(0, _MOST, _SEARCHED):
         for mission, repetition in plan.numbered(item, first, first + _SEARCHED):
@@ -294,7 +302,7 @@ def _first_missing(plan: FlightsPlan, entry: _OpenClaim, flown: Collection[str])
 
 
 def _cost(still: Sequence[_OpenClaim], limit_s: float) -> list[str]:
-    """Describe the wall time needed to decide the open claims if all effects stay the same."""
+    """Return lines on the wall time needed to decide the open claims if all effects stay equal."""
     if not still:
         return ["every claim that missions can decide is decided"]
     some = [entry for entry in still if not math.isinf(entry.seconds)]
@@ -320,7 +328,10 @@ def _undecided(entry: _OpenClaim) -> str:
 
 
 def _bounds(claim: Claim, judgement: Judgement) -> str:
-    """Describe an effect's bounds, and whether they exclude the claim's size, or why none exist."""
+    """Return words for the bounds of an effect, or for the reason why it has none.
+
+    They also state whether the bounds exclude an effect of the claim's size.
+    """
     effect, bounds = judgement.effect, judgement.bounds
     if effect is None or bounds is None:
         return f" ({judgement.why})"

@@ -65,19 +65,19 @@ class CampaignSource:
 
     @property
     def stacks(self) -> list[str]:
-        """The flown stacks, sorted."""
+        """The stacks on which missions were flown, sorted by name."""
         return sorted(set(self.flights["stack"]))
 
     @property
     def seeds(self) -> tuple[int, int] | None:
-        """The smallest and the largest seed of its flights; None without flights."""
+        """The smallest and the largest seed of its flights, or None if it has no flights."""
         seeds = [seed for seed in self.flights["seed"] if seed is not None]
         return (min(seeds), max(seeds)) if seeds else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """The campaigns and kernel summaries that were read.
+    """The campaigns and kernel summaries that were read, with the problems found in them.
 
     Attributes:
         problems: one sentence for each source that could not be read, is incomplete, or does not
@@ -146,7 +146,10 @@ class Evidence:
 
 
 def _paths_in(place: Path) -> Iterator[Path]:
-    """Yield the ledgers, kernel summaries and exports in a folder, sorted, or a file itself."""
+    """Yield the ledgers, kernel summaries and exports at any depth of a folder, sorted.
+
+    A file yields only itself.
+    """
     if not place.exists():
         raise RecordError(f"{place}: does not exist")
     if place.is_file():
@@ -239,7 +242,10 @@ def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
 
 
 def _unpaired(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
-    """Report faulty flights without golden flights, and campaigns with no paper-like flight."""
+    """Yield a sentence for each campaign with faulty flights that lack a golden flight.
+
+    Yield another one for each campaign in which no flight is like the paper's.
+    """
     pooled = Flights.pooled([source.flights for source in campaigns])
     paired = {
         changes

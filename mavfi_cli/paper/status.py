@@ -39,7 +39,9 @@ _SETTINGS = "settings"  # name of the table of a user's own campaign
 
 
 def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, Flights | None]:
-    """Return the main table of a campaign, and the flights that its figure needs, or None.
+    """Return the main table of a campaign, and the flights from which its figure is drawn.
+
+    The flights are None if the table is not that of an item that flies missions.
 
     The table is that of the named item or, without a name, of the preset's item. Without either, or
     for a stratified campaign without a name, it lists the items of a reproduction, or the settings
@@ -71,14 +73,20 @@ def _of_export(item: Item, flights: Flights, path: Path) -> Flights:
     parts = [of_kind(item, stack, flights.chosen(stack=stack)) for stack in set(flights["stack"])]
     flown = [part for part in parts if len(part)]
     if len(flown) > 1:
-        raise RecordError(f"{path}: has {item.paper} on several stacks; export each separately")
+        raise RecordError(
+            f"{path}: contains flights for {item.paper} on several stacks; export each stack "
+            "separately"
+        )
     if not flown:
         raise RecordError(f"{path}: contains no flights for {item.paper}")
     return flown[0]
 
 
 def _item_of(ledger: Ledger, name: str | None) -> Item | None:
-    """Return the named item or, without a name, the item of the campaign's preset, or None."""
+    """Return the named item or, without a name, the item of the campaign's preset.
+
+    Return None if there is no name and the campaign was not made from the preset of an item.
+    """
     preset = (ledger.meta("name") or "").partition("-")[0]  # without the suffix for changes
     own = [item for item in ITEMS if item.preset == preset] if preset in PRESETS.names else []
     if name is None:
@@ -124,7 +132,9 @@ def _unflown(item: Item, out: Path) -> PaperTable:
         return of_model()
     path = out / KERNELS_FOLDER / KERNELS
     if not path.is_file():
-        raise RecordError(f"{path.parent}: contains no kernel runs (mavfi reproduce fig6)")
+        raise RecordError(
+            f"{path.parent}: contains no kernel runs; make them with `mavfi reproduce fig6`"
+        )
     return of_kernels(KernelSummary.read(path).kernels)
 
 
@@ -233,7 +243,7 @@ def _progress_table(ledger: Ledger, plan: FlightsPlan) -> PaperTable:
 
 
 def short(table: PaperTable) -> PaperTable:
-    """Cut a table to one screen: keep its first rows and, if it lists settings, first columns."""
+    """Shorten a table to one screen: its first rows and, in a table of settings, first columns."""
     titles = [column.title for column in table.columns]
     wide = _WIDE + (_DEVIATION in titles) if table.name == _SETTINGS else len(titles)
     left = [title.partition(",")[0] for title in titles[wide:]]

@@ -96,7 +96,7 @@ class Claim:
         item: table, figure or section, such as `fig6`.
         find: function that computes the finding from a stack's flights and the isolated kernels.
         low, high: ends of the range of the effect.
-        size: size of the effect in the paper; None if the paper states none.
+        size: size of the effect in the paper; None if the paper does not state it.
         rule: the range and its origin, in words.
         isolated: whether the claim is about isolated kernels instead of flights.
         fates: fates of faults for which the claim is judged separately.
@@ -121,7 +121,7 @@ class Claim:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JudgedClaim:
-    """A claim with its verdicts.
+    """A claim with its judgements on stacks or in isolated kernels.
 
     Attributes:
         judgements: judgements by stack or ISOLATED, and then by the fate of the faults.
@@ -131,7 +131,11 @@ class JudgedClaim:
     judgements: Mapping[str, Mapping[Fate, Judgement]]
 
     def verdict(self, place: str, fate: Fate = Fate.ALL) -> Verdict | None:
-        """Return the verdict on a stack, or on ISOLATED; None if the claim is not judged there."""
+        """Return the verdict at `place`, or None if the claim was not judged there.
+
+        Args:
+            place: a stack or ISOLATED.
+        """
         judgement = self.judgements.get(place, {}).get(fate)
         return None if judgement is None else judgement.verdict
 
@@ -156,7 +160,7 @@ class SettledClaim:
     Attributes:
         looks: number of looks that followed missions flown for this claim.
         missions: number of those missions; other claims use them as well.
-        seconds: wall time of those missions, s.
+        seconds: wall time of those missions, in seconds.
         verdict: the verdict at the last look.
     """
 
@@ -171,9 +175,11 @@ class Settling:
     """The record of the looks at claims, and of the missions flown to settle them.
 
     Attributes:
-        first: first look at each claim that had an effect then, by name and fate of the faults.
+        first: first look at each claim that had an effect then, keyed by claim name and then by
+            the fate of the faults.
         looks: number of looks that followed missions flown for any claim.
-        claims: missions flown for each claim, by name; absent if there were none.
+        claims: missions flown for each claim, keyed by claim name; claims without such missions are
+            omitted.
     """
 
     first: Mapping[str, Mapping[str, FirstLook]] = field(default_factory=dict)
@@ -182,7 +188,9 @@ class Settling:
 
     @classmethod
     def of(cls, stored: Any) -> Self | None:
-        """Parse a stored value, as JSON text or as its contents; None if nothing was settled.
+        """Parse a record that was stored as JSON, from its text or its decoded contents.
+
+        Return None if `stored` is None, because nothing was settled.
 
         Raises:
             ConfigError: the contents do not have the expected structure.
@@ -196,11 +204,11 @@ class Settling:
         return structure(contents, cls)
 
     def to_json(self) -> str:
-        """Return the text that `of` reads."""
+        """Return the record as JSON text that `of` can parse."""
         return json.dumps(asdict(self), sort_keys=True)
 
     def first_look(self, name: str, fate: str) -> FirstLook | None:
-        """Return the first look at a claim; None if it had no effect then."""
+        """Return the first look at a claim for one fate, or None if it had no effect then."""
         return self.first.get(name, {}).get(fate)
 
     def describe(self, name: str) -> str:
@@ -219,7 +227,7 @@ def judge(
     ranges: Sequence[tuple[float, float]],
     first: Sequence[FirstLook | None] | None = None,
 ) -> list[Judgement]:
-    """Judge a family of claims.
+    """Judge a family of claims, and correct the p-values for the number of claims.
 
     If missions were added to settle claims, half of the level is spent on the first look, whose
     number of missions was planned, and half on all looks together. A p-value is then twice the
@@ -308,10 +316,10 @@ def _two_sided(z: float) -> float:
 
 
 def margin(missions: int) -> float:
-    """Return the smallest effect that counts, for groups of the paper's number of missions.
+    """Return the smallest effect that groups of `missions` missions each can rule out.
 
-    A rate of 0 in that many missions rules this effect out in a family of four claims, so a claim
-    of such an effect can be contradicted. The effect is the upper end of Wilson's interval for 0 of
+    A rate of 0 in so many missions rules this effect out in a family of four claims, so a claim of
+    such an effect can be contradicted. The effect is the upper end of Wilson's interval for 0 of
     n at confidence 1 - 0.05/4, rounded up to half a point.
     """
     high = wilson(0, missions, confidence=1.0 - LEVEL / _FAMILY).high

@@ -1,1 +1,1 @@
-"""Summaries, tables, CSV and pictures."""
+"""Reports on flights and campaigns: text, tables, CSV, HTML and pictures."""

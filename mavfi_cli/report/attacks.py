@@ -1,4 +1,4 @@
-"""Counts, shares and intervals of attacks on kernels or a program, and the plan behind them."""
+"""Summaries of attack campaigns on kernels or on a program: outcome counts, shares, intervals."""
 
 from __future__ import annotations
 
@@ -40,9 +40,13 @@ PROGRAM_COLUMNS = f"run outcome signal exit_code magnitude {_OF_EVERY_RUN}".spli
 
 
 def _share(runs: TargetRuns, hits: Iterable[bool], *, of_all: bool = False) -> Share:
-    """Return the share of hits among the injected runs, or among all.
+    """Return the share of hits among the runs of a target in which the fault was injected.
 
-    If windows are sampled, the spread between them widens the interval.
+    If windows of executed instructions are sampled, the spread between them widens the interval.
+
+    Args:
+        hits: whether each run is a hit.
+        of_all: also count the runs in which the fault was not injected.
     """
     chosen: list[bool] = []
     windows: list[Cluster | None] = []
@@ -63,7 +67,7 @@ def _share(runs: TargetRuns, hits: Iterable[bool], *, of_all: bool = False) -> S
 
 
 def _share_entry(share: Share) -> Json:
-    """Return a share as an entry of `kernels.json`; the share of zero runs is None."""
+    """Return a share as an entry of `kernels.json`. Its value is None if there are no runs."""
     return {
         "count": share.count, "of": share.total, "share": _finite(share.share),
         "wilson95": [share.low, share.high],
@@ -72,7 +76,11 @@ def _share_entry(share: Share) -> Json:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _TargetCounts:
-    """The counts of one target; shares are relative to the *injected* runs."""
+    """How often the runs of one target ended in each outcome, with the details of these runs.
+
+    Shares are relative to the *injected* runs. Only the share of runs in which the fault was not
+    injected is relative to all runs.
+    """
 
     null_runs: NullRuns
     outcomes: dict[str, Share]
@@ -82,7 +90,7 @@ class _TargetCounts:
 
     @classmethod
     def of(cls, runs: TargetRuns) -> _TargetCounts:
-        """Count the runs of a target."""
+        """Count the outcomes of the runs of a target."""
         records = runs.records
         reasons = (entry["not_injected_reason"] for entry in records)
         return cls(
@@ -102,11 +110,11 @@ class _TargetCounts:
 
     @property
     def differing(self) -> float:
-        """Upper 95 % bound of the share of runs whose output differs even without a flip."""
+        """Upper 95 % confidence bound on the share of runs whose output differs without a flip."""
         return unseen_share(self.null_runs.reached)
 
     def as_dict(self) -> Json:
-        """Return plain values, as in `kernels.json`."""
+        """Return the counts as plain values, as in `kernels.json`."""
         null_runs = self.null_runs
         return {
             "null_runs": {
@@ -120,7 +128,7 @@ class _TargetCounts:
         }  # fmt: skip
 
     def lines(self, indent: str) -> Iterator[str]:
-        """Yield null runs, crashes, reasons and activations as text."""
+        """Yield lines on null runs, crashes, activations, and why faults were not injected."""
         null_runs = self.null_runs
         counting = _listed(dict(sorted(null_runs.counting.items())))
         yield (
@@ -140,12 +148,12 @@ class _TargetCounts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _KernelCounts:
-    """The runs of a kernel with their counts.
+    """The runs of a kernel, the counts of their outcomes, and the sizes of silent corruptions.
 
     Attributes:
         noticeable: the share of runs with a silent corruption beyond the kernel's own tolerance.
-        sdc: relative sizes of silent corruptions; None for one without a relative size.
-        parts: sizes of silent corruptions by part, in ascending order.
+        sdc: relative size of each silent corruption; None if it has no relative size.
+        parts: sizes of silent corruptions by part of the output, in ascending order.
     """
 
     kernel: Kernel
@@ -157,7 +165,7 @@ class _KernelCounts:
 
     @classmethod
     def of(cls, runs: TargetRuns) -> _KernelCounts:
-        """Count the runs of a kernel."""
+        """Count the outcomes of a kernel's runs, and collect the sizes of silent corruptions."""
         assert isinstance(runs.target, KernelTarget)
         sizes = [entry["magnitude"] for entry in _with(runs.records, RunOutcome.SDC)]
         parts: dict[str, list[float]] = {}
@@ -177,11 +185,11 @@ class _KernelCounts:
 
     @property
     def comparable(self) -> list[float]:
-        """Relative sizes of the silent corruptions that have one, in ascending order."""
+        """Relative sizes of silent corruptions in ascending order, without those that have none."""
         return sorted(size for size in self.sdc if size is not None)
 
     def as_dict(self) -> Json:
-        """Return plain values, as in `kernels.json`."""
+        """Return the kernel's results as plain values, as in `kernels.json`."""
         runs, records = self.runs, self.runs.records
         run_s = sum(entry["run_s"] for entry in records)
         return {
@@ -207,7 +215,7 @@ class _KernelCounts:
         }  # fmt: skip
 
     def lines(self) -> Iterator[str]:
-        """Yield the notes on the runs as text."""
+        """Yield lines on the kernel's scope, inputs, runs and silent corruptions."""
         yield f"{self.kernel.title}: scope {', '.join(self.runs.context['scope'])}"
         for number in range(len(self.runs.goldens)):
             yield f"  input {number}: {_population(self.runs, number)}"
@@ -229,7 +237,7 @@ class _KernelCounts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelsSummary:
-    """The summary of a campaign on kernels.
+    """The results of an attack campaign on isolated kernels.
 
     Attributes:
         plan: everything that the results depend on.
@@ -240,12 +248,12 @@ class KernelsSummary:
     kernels: list[_KernelCounts]
 
     def as_dict(self) -> Json:
-        """Return plain values, the contents of `kernels.json`."""
+        """Return the summary as plain values, which are the contents of `kernels.json`."""
         kernels = [kernel.as_dict() for kernel in self.kernels]
         return {"schema": SCHEMA, "plan": self.plan, "sampling": self.sampling, "kernels": kernels}
 
     def text(self) -> str:
-        """Return a table with one row per kernel, and notes."""
+        """Return a table of outcomes with one row per kernel, followed by notes, as text."""
         head = ["kernel", "runs", *(outcome.title for outcome in RunOutcome)]
         rows = [
             [kernel.kernel.title, str(len(kernel.runs.records)),
@@ -265,7 +273,7 @@ class KernelsSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProgramSummary:
-    """The summary of a campaign on a program."""
+    """The results of an attack campaign on one program."""
 
     runs: TargetRuns
     sampling: str
@@ -273,7 +281,7 @@ class ProgramSummary:
     counts: _TargetCounts
 
     def as_dict(self) -> Json:
-        """Return plain values, as `--json` prints them."""
+        """Return the summary as plain values, as `--json` prints them."""
         runs, profile = self.runs, self.runs.profile
         part = partial(getattr, profile) if profile is not None else lambda _name: None
         return {
@@ -293,7 +301,7 @@ class ProgramSummary:
         }
 
     def text(self) -> str:
-        """Return a table with one row per outcome, and notes."""
+        """Return a table with one row per outcome, followed by notes, as text."""
         lines = [f"{'outcome':<14}{'runs':>7}{'share':>9}   95 % interval"]
         for name, share in self.counts.outcomes.items():
             lines.append(
@@ -313,7 +321,7 @@ class ProgramSummary:
 
 
 def summarise(plan: Plan, campaign: Sequence[TargetRuns]) -> KernelsSummary | ProgramSummary:
-    """Summarise a campaign on kernels or on a program."""
+    """Summarise the runs of an attack campaign on kernels or on a program."""
     sampling, first = plan.strategy().name, campaign[0]
     if isinstance(first.target, KernelTarget):
         kernels = [_KernelCounts.of(runs) for runs in campaign]
@@ -324,7 +332,7 @@ def summarise(plan: Plan, campaign: Sequence[TargetRuns]) -> KernelsSummary | Pr
 
 
 def _counted(names: Iterable[str]) -> dict[str, int]:
-    """Count each name, the most frequent first."""
+    """Return how often each name occurs, with the most frequent name first."""
     return dict(sorted(Counter(names).items(), key=lambda item: (-item[1], item[0])))
 
 
@@ -353,19 +361,19 @@ def _median(sizes: Sequence[float]) -> float:
 
 
 def _sizes(sizes: Sequence[float]) -> dict[str, float | None]:
-    """Return the median and the largest of sizes in ascending order."""
+    """Return the median and the largest of `sizes`, which are in ascending order."""
     largest = sizes[-1] if sizes else None
     return {"median": _median(sizes) if sizes else None, "largest": largest}
 
 
 def _population(runs: TargetRuns, number: int) -> str:
-    """Describe how much of an input's run was profiled."""
+    """Describe the population from which the faults of an input are drawn."""
     profile = runs.profiles[number]
     return "moments of one call" if profile is None else profile.describe()
 
 
 def _input(runs: TargetRuns, number: int) -> Json:
-    """Return an input as plain values: how far it was profiled, and the outcomes of its runs."""
+    """Return the profile, the golden run and the outcomes of one input as plain values."""
     profile, golden = runs.profiles[number], runs.goldens[number]
     length = None if profile is None else profile.instructions
     return {
@@ -384,13 +392,14 @@ def _input(runs: TargetRuns, number: int) -> Json:
 def save_runs(
     folder: Path, summary: KernelsSummary | ProgramSummary, campaign: Sequence[TargetRuns]
 ) -> Sequence[str]:
-    """Write kernels.csv, kernels.json and, for a campaign on kernels, a picture.
+    """Write the results of a campaign to a folder: CSV, JSON and, for kernels, a picture.
 
-    The CSV file has one line per run; cells without a value are empty. The JSON file of a program
-    also contains its golden run and all other runs.
+    The files are kernels.csv, kernels.json and, for a campaign on kernels, kernels.svg. The CSV
+    file has one line per run; cells without a value are empty. The JSON file of a program also
+    contains its golden run and all other runs.
 
     Returns:
-        The names of the files.
+        The names of the written files.
 
     Raises:
         RecordError: a file cannot be written.
@@ -456,7 +465,10 @@ def _kernel_figure(summary: KernelsSummary) -> Figure:
 
 
 def _bar(axes: Axes, place: int, outcomes: Mapping[str, Share]) -> None:
-    """Stack the segments of a bar. All but the last have an interval at their upper edge."""
+    """Draw a kernel's outcomes as stacked segments of a bar.
+
+    Each segment except the last one has the interval of its share at its upper edge.
+    """
     base, below = 0.0, -_LINE / 2  # keeps numbers off the axis
     for number, (name, colour) in enumerate(_COLOURS.items()):
         row = outcomes[name]

@@ -1,4 +1,4 @@
-"""A campaign as text: settings, comparisons, quality of flight, overhead, failures."""
+"""Text reports of a campaign: settings, comparisons, quality of flight, overhead and failures."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class CampaignReport:
     Attributes:
         stopped: settings that the stopping rule has ended early.
         fixed_world: the fixed world of all missions; None if there is none.
-        quality, overhead, failures: None unless requested.
+        quality, overhead, failures: the optional parts of the report; None unless requested.
     """
 
     summary: CampaignSummary
@@ -79,12 +79,12 @@ class CampaignReport:
         kernels: Path | None = None,
         upsets: float | None = None,
     ) -> Self:
-        """Analyse a campaign.
+        """Analyse the results in a campaign's ledger.
 
         Args:
-            by: labels by which settings are grouped; empty means all.
+            by: labels by which missions are grouped into settings; empty means all labels.
             confidence: confidence level of all intervals.
-            quality, overhead, failures: parts to add.
+            quality, overhead, failures: whether to add these parts.
             kernels, upsets: arguments of `analysis.failures.setting_failures`.
 
         Raises:
@@ -104,12 +104,12 @@ class CampaignReport:
         )
 
     def as_dict(self) -> Json:
-        """Return the content of `--json`: the summary and the requested parts."""
+        """Return the values that `--json` prints: the summary and the requested parts."""
         parts = {name: part for name, part in asdict(self).items() if part is not None}
         return {**parts.pop("summary"), **parts}
 
     def lines(self) -> list[str]:
-        """Return the tables, without the stopped settings and the fixed world."""
+        """Return the report as lines of text, without those of `state_lines`."""
         confidence, lines = self.summary.confidence, _summary_lines(self.summary)
         if self.quality:
             lines += quality_lines(self.quality, confidence)
@@ -121,7 +121,7 @@ class CampaignReport:
 
 
 def state_lines(ledger: Ledger) -> list[str]:
-    """Return lines on the fixed world and on settings that the stopping rule has ended early."""
+    """Return lines on the fixed worlds, and on settings that the stopping rule has ended early."""
     spec = stored_spec(ledger)
     return [
         *filter(None, [spec.describe_worlds() if spec else ""]),
@@ -225,7 +225,11 @@ def _comparison_lines(settings: SettingColumns, comparisons: Sequence[Comparison
 
 
 def _comparison_cells(row: Comparison) -> list[str]:
-    """Return the cells of a comparison; the last one is empty without a recovered share."""
+    """Return the cells of a comparison in the table.
+
+    The last cell is empty if the recovered share of the increase over the mean golden flight is
+    undefined.
+    """
     time = row.differences["flight_time_s"]
     return [
         f"{row.success.pairs}",
@@ -251,7 +255,7 @@ def _worst(worst: WorstCase) -> str:
 
 
 def quality_lines(quality: Sequence[Quality], confidence: float = 0.95) -> list[str]:
-    """Return a table for each metric: mean, extremes, and difference from golden flights."""
+    """Return a table per metric as lines: mean, extremes, and difference from golden flights."""
     settings = SettingColumns.of([row.labels for row in quality if row.metric == METRICS[0]])
     head = ["flights", f"mean ({_sure(confidence)})", "least", "median", "most", "to golden"]
     lines = []
@@ -278,7 +282,7 @@ def _quality_cells(row: Quality, scale: float) -> list[str]:
 
 
 def overhead_lines(overhead: Sequence[FlightOverhead], confidence: float = 0.95) -> list[str]:
-    """Return a table of checks and one of recomputations."""
+    """Return two tables on detectors as lines: the cost of checks, and that of recomputations."""
     if not overhead:
         return ["", "overhead: no flight with a detector"]
     settings = SettingColumns.of([row.labels for row in overhead])
@@ -321,7 +325,13 @@ def _recovery_cells(row: FlightOverhead) -> list[str]:
 
 
 def _overhead_percent(share: Interval, *, ends: bool = True) -> str:
-    """Format per cent with four decimals, as in the paper's table; tiny values as "<0.0001"."""
+    """Format a share in per cent with four decimals, as in the paper's table.
+
+    Positive values that would round to zero become `<0.0001`.
+
+    Args:
+        ends: whether to add the ends of the interval.
+    """
     value, *between = spread(share, 4, 100.0).split(" ", 1)
     value = "<0.0001" if 0.0 < share.value < 0.5e-6 else value
     return " ".join([value, *between]) if ends else value
@@ -331,7 +341,7 @@ def _overhead_percent(share: Interval, *, ends: bool = True) -> str:
 
 
 def failure_lines(failures: Sequence[SettingFailures]) -> list[str]:
-    """Return a paragraph for each setting."""
+    """Return a paragraph per setting on how often its injected faults fail missions."""
     paired = any(row.golden is None for row in failures) or not failures
     which = " whose golden flights succeed" if paired else ""
     lines = ["", f"injected faults that fail missions{which}:"]
@@ -365,10 +375,12 @@ def _failure_parts(row: SettingFailures) -> list[str]:
 
 
 def flights_file(table: pa.Table, path: Path) -> bytes:
-    """Return an exported table as the content of a .parquet or .csv file; as CSV for `-`.
+    """Return an exported table of flights as the content of the file `path`.
+
+    The suffix selects the format, Parquet or CSV. The path `-` means CSV.
 
     Raises:
-        ConfigError: the file has another suffix.
+        ConfigError: the suffix is neither .parquet nor .csv.
     """
     from pyarrow import csv, parquet
 
@@ -384,7 +396,7 @@ def flights_file(table: pa.Table, path: Path) -> bytes:
 
 
 def _flat(table: pa.Table) -> pa.Table:
-    """Return the table with its lists as JSON text, because CSV has no lists."""
+    """Return the table with lists converted to JSON text, because CSV has no lists."""
     for place, field in enumerate(table.schema):
         if pa.types.is_list(field.type):
             texts = [

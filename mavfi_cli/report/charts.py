@@ -1,4 +1,4 @@
-"""Charts of the page: SVG in the page's own font and colours, each with its data as CSV."""
+"""Charts of the HTML report: SVG in the page's own font and colours, each with its data as CSV."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ Curve = tuple[str, str, FloatArray]  # label, detector, sorted added seconds (in
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Picture:
-    """A chart of the page.
+    """A chart of the HTML report, with its numbers.
 
     Attributes:
-        name: name of its CSV file, without suffix.
-        title: its caption and alt text.
-        markup: an SVG element.
-        csv: its numbers.
-        narrow: the SVG element for a narrow screen; empty if `markup` serves both.
+        name: name of the CSV file, without suffix.
+        title: caption and alt text.
+        markup: the chart as an SVG element.
+        csv: the numbers in the chart.
+        narrow: SVG element for narrow screens; empty if `markup` serves all screens.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Picture:
     def of(
         cls, name: str, title: str, figure: Figure, csv: str, narrow: Figure | None = None
     ) -> Picture:
-        """Convert a figure, and one for narrow screens if given, to a chart in the page's style."""
+        """Convert a figure, with an optional variant for narrow screens, to a report chart."""
         wide, small = (_markup(part) if part else "" for part in (figure, narrow))
         return cls(name=name, title=title, markup=wide, csv=csv, narrow=small)
 
@@ -73,13 +73,13 @@ def _markup(figure: Figure) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForestRow:
-    """A claim in the forest plot.
+    """A row of the forest plot: the range of one claim, and the effects measured for it.
 
     Attributes:
         low, high: ends of the claimed range; infinite where it is open.
         number: whether the effect is a plain number; otherwise it is a share.
-        effects: one effect per stack; None if the stack was not flown or has no number.
-        verdict: verdict on the first stack.
+        effects: one effect per stack; None if the stack was not flown or gives no effect.
+        verdict: verdict on the claim for the first stack.
     """
 
     label: str
@@ -145,7 +145,10 @@ def draw_forest(rows: Sequence[ForestRow], stacks: Sequence[str], columns: str =
 
 
 def _effect(axes: Axes, y: float, effect: Interval, scale: float, place: int, verdict: str) -> None:
-    """Draw an effect with its interval; the first stack's effect has the verdict's colour."""
+    """Draw the effect of stack number `place` with its interval.
+
+    The effect of the first stack has the colour of the verdict.
+    """
     colour = _VERDICTS.get(verdict, NOTE) if not place else NOTE
     height = y - 0.14 if not place else y + 0.26
     width, size = (1.3, 3.2) if not place else (0.6, 2.2)
@@ -162,12 +165,14 @@ def _effect(axes: Axes, y: float, effect: Interval, scale: float, place: int, ve
 def draw_delays(
     panels: Mapping[str, Sequence[Curve]], golden_s: Sequence[float], columns: str = "two"
 ) -> Figure:
-    """Draw the share of flights delayed by more than a given time, in seconds and per cent.
+    """Draw the share of flights that are delayed by more than a time, as a function of that time.
+
+    The time is shown in seconds, and in per cent of the mean golden flight time.
 
     Args:
+        panels: curves of each panel, by its title.
+        golden_s: mean flight time of the golden flights of each panel, in seconds.
         columns: `one` on a narrow screen, otherwise `two`.
-        panels: curves by title.
-        golden_s: mean flight time of the golden flights of each panel.
     """
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
@@ -217,10 +222,11 @@ def _per_cent_of(
 
 
 def draw_arms(arms: Sequence[tuple[str, Share, float | None]]) -> Figure:
-    """Draw the share of lost missions in each arm.
+    """Draw the share of lost missions in each arm of an experiment, with its 95 % interval.
 
     Args:
-        arms: name, share of lost missions, and corrected p-value; None for the unprotected arm.
+        arms: name, share of lost missions, and corrected p-value of each arm. The unprotected arm
+            has None as its p-value.
     """
     figure = new_figure(WIDTHS_IN["one"], 0.6 + 0.17 * len(arms))
     axes = figure.add_subplot()
@@ -241,7 +247,12 @@ _FATES = {"never read": "#dfe5ec", "same flight": "#b9c6d4", "changed flight": "
 
 
 def draw_flows(flows: Mapping[str, Mapping[str, Share]]) -> Figure:
-    """Draw a bar per struck kernel, divided into the shares of its fates."""
+    """Draw a bar per struck kernel, divided by what the faults did to the kernel.
+
+    Args:
+        flows: shares of lost missions by kernel and fate, such as `crashed`. The total of a share
+            is the number of missions with that fate.
+    """
     figure = new_figure(WIDTHS_IN["one"], 0.9 + 0.26 * len(flows))
     axes = figure.add_subplot()
     print_axes(axes)

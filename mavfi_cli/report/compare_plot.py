@@ -47,7 +47,7 @@ _RATIOS = (
 
 
 def _draw_comparison(comparison: PlatformComparison) -> Figure:
-    """Draw a figure of five panels, with one colour per platform."""
+    """Draw the flights of all platforms in five panels, with one colour per platform."""
     figure = new_figure(12.0, 8.0)
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # type: ignore[union-attr, call-arg]
     panels = figure.subplot_mosaic("TTTTSS;RRMMWW")
@@ -204,7 +204,10 @@ def _response(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, 
 
 
 def _ratios(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, str]) -> None:
-    """Draw each platform's ratios to the first, by mission: golden filled, faulty hollow."""
+    """Draw the ratios of each platform to the first one, mission by mission.
+
+    Markers are filled for golden flights, and hollow for flights with faults.
+    """
     drawn = [row for row in comparison.ratios if row.setting in (_GOLDEN, _NONE)]
     titles = {row.platform: row.title for row in comparison.plan.platforms}
     first = comparison.plan.platforms[0].title
@@ -398,7 +401,10 @@ def _time(seconds: float) -> str:
 
 
 def _steps(axes: Axes, row: Timeline) -> None:
-    """Link the end of each invocation to the next start; a level line shows a waiting message."""
+    """Draw a line from the end of each invocation to the start of the next one in the chain.
+
+    The horizontal part of a line shows how long the message waits.
+    """
     places = {kernel: lane for lane, kernel in enumerate(_LANES)}
     links = [("point_cloud", "octomap"), ("octomap", "collision_check"),
              ("collision_check", "control")]  # fmt: skip

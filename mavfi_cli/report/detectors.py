@@ -41,7 +41,7 @@ _INTERVALS = "in brackets: 95 % intervals (Wilson for shares, bootstrap for the 
 
 
 def detector_lines(evaluation: Evaluation) -> list[str]:
-    """Return the evaluation as text and tables."""
+    """Return the lines that report an evaluation of detectors, as text and tables."""
     lines = _head(evaluation)
     lines += ["", "Without faults, against the same flights without a detector"]
     lines += Table([*_error_free_rows(evaluation.error_free)]).lines()
@@ -199,7 +199,7 @@ def _share(share: Share) -> str:
 
 
 def detector_csv(*pairs: pa.Table) -> str:
-    """Return CSV text with one row per pair: first pairs without a fault, then those with one."""
+    """Return the pairs of flights in one or more tables as CSV, with one row per pair."""
     rows = (row for table in pairs for row in table.select([*CSV]).to_pylist())
     return Table.of_records(rows, [*CSV]).csv()
 
@@ -241,7 +241,10 @@ def _draw_roc(evaluation: Evaluation) -> Figure:
 
 
 def _at_threshold(curve: DetectorCurves) -> tuple[float, float]:
-    """Return recall and precision at the detector's threshold; precision is 1 without alarms."""
+    """Return recall and precision at the detector's own threshold.
+
+    The precision is 1 if there are no alarms.
+    """
     fallout, recall = curve.operating_point
     hits, false = recall * curve.positives, fallout * curve.negatives
     return recall, hits / (hits + false) if hits + false else 1.0
@@ -258,7 +261,7 @@ def _square(axes: Axes, x: str, y: str) -> None:
 
 
 def _draw_recovery(evaluation: Evaluation) -> Figure:
-    """Draw the share of harmful faults undone, by stage, and the worst flights by world."""
+    """Draw how often each detector undoes harm, by stage, and the worst flight times, by world."""
     rows = evaluation.faults
     names = list(dict.fromkeys(row.detector for row in rows))
     colours = detector_colours(names)
@@ -295,9 +298,10 @@ def _bars(
     measure: Any,
     count: Any,
 ) -> None:
-    """Draw grouped bars in per cent: a group per value of the rows, with a bar per detector.
+    """Draw bars in per cent, with a group per `value` of the rows, and a bar per detector.
 
     Args:
+        names: Detectors, in the order of the bars in a group.
         measure: Function from a row to its value and interval; NaN if there is none.
         count: Function from a row to its number of cases; a row without cases has no bar.
     """
@@ -323,7 +327,9 @@ def _bars(
 
 
 def draw_loss_curve(curve: Sequence[Sequence[float]]) -> Figure:
-    """Draw the mean squared errors of scaled deltas over the epochs, on a logarithmic scale.
+    """Draw an autoencoder's loss over the epochs, on a logarithmic scale.
+
+    The loss is the mean squared error of scaled deltas.
 
     Args:
         curve: Rows of epoch, mean training error and largest validation error.

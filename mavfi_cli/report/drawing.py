@@ -1,4 +1,4 @@
-"""Colours and frames of all pictures, and the function that saves them."""
+"""Colours, frames and legends that all pictures share, and functions to save pictures."""
 
 from __future__ import annotations
 
@@ -56,7 +56,10 @@ KERNELS = {  # labels and colours
 
 
 def detector_colours(names: Sequence[str]) -> dict[str, str]:
-    """Return the colour of each detector, including `none`. Plug-ins share a cycle of colours."""
+    """Return the colours of `names`, which are detectors or `none`, keyed by name.
+
+    Plug-in detectors share a cycle of colours.
+    """
     known = {"none": NONE, **DETECTORS}
     others = [name for name in names if name not in known]
     return {
@@ -72,7 +75,12 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def open_frame(axes: Axes, title: str = "", grid: str = "", **title_look: Any) -> None:
-    """Hide the top and right of the frame; add a title, and a grid along one axis or `both`."""
+    """Hide the top and right edges of a frame, and add a title and a grid if they are given.
+
+    Args:
+        grid: axis of the grid, `x`, `y` or `both`; empty means no grid.
+        title_look: text properties of the title that replace the defaults.
+    """
     axes.spines[["top", "right"]].set_visible(False)
     if grid:
         axes.grid(visible=True, axis=grid, color=GRID, linewidth=0.6)  # type: ignore[arg-type]
@@ -88,14 +96,17 @@ def legend_above(figure: Figure, *what: Any, **look: Any) -> None:
 
 
 def scattered(count: int) -> FloatArray:
-    """Return offsets from -0.5 to 0.5 that spread dots evenly, the same in every call, (count,)."""
+    """Return `count` offsets between -0.5 and 0.5 that spread overlapping dots evenly.
+
+    The array has shape (count,), and is the same in every call.
+    """
     import numpy as np  # here, because the commands load this module
 
     return (0.5 + np.arange(count, dtype=np.float64) * _TURN) % 1.0 - 0.5
 
 
 def whisker(axes: Axes, x: float, value: float, ends: tuple[float, float], **look: Any) -> None:
-    """Draw the interval around a value, if it has one."""
+    """Draw the interval `ends` around a value as an error bar, unless one of the numbers is NaN."""
     if math.isfinite(value) and not any(map(math.isnan, ends)):
         low, high = (abs(end - value) for end in ends)
         shape = {"fmt": "none", "ecolor": INK, "elinewidth": 1.1, "capsize": 3.0}
@@ -103,7 +114,7 @@ def whisker(axes: Axes, x: float, value: float, ends: tuple[float, float], **loo
 
 
 def note_at(axes: Axes, text: str, place: tuple[float, float], up: float, **look: Any) -> None:
-    """Write a text at a place, raised by `up` points."""
+    """Write `text` at the position `place`, raised by `up` points."""
     shape = {"ha": "center", "fontsize": 8.5, "color": INK}
     offset = {"xytext": (0, up), "textcoords": "offset points"}
     axes.annotate(text, place, **{**shape, **offset, **look})
@@ -121,7 +132,7 @@ def write_figure(figure: Figure, path: Path) -> None:
 
 
 def svg(figure: Figure) -> str:
-    """Return a figure as SVG. Equal figures give equal texts."""
+    """Return a figure as SVG text. Equal figures give equal texts."""
     return _drawn(figure, "svg").decode()
 
 

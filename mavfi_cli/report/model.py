@@ -53,13 +53,16 @@ _OVER: Sequence[tuple[str, str, Sequence[str]]] = (
 
 
 def model_json(model: ModelReport, flights: FlightsReport | None = None) -> Any:
-    """Return the model as plain values, with its flights, if any, under the key `flights`."""
+    """Return the report of the model as plain values.
+
+    If a report of its flights is given, it is under the key `flights`.
+    """
     parts = {} if flights is None else {"flights": _with_rows(flights)}
     return plain(_with_rows(model) | parts)
 
 
 def model_csv(model: ModelReport | FlightsReport) -> str:
-    """Return the model or its flights as CSV text, one row per vehicle and scheme.
+    """Return the report of the model, or of its flights, as CSV with a row per vehicle and scheme.
 
     The column names include the units.
     """
@@ -85,7 +88,10 @@ def _with_rows(report: ModelReport | FlightsReport) -> Json:
 
 
 def _cells_of(row: SchemeResult | FlownScheme) -> Json:
-    """Return the cells of a scheme by column name; a cell with several texts is a tuple."""
+    """Return the row of one scheme as values keyed by column name.
+
+    A value that consists of several texts, such as `errors`, is a tuple.
+    """
     if isinstance(row, SchemeResult):
         cells = asdict(row)
         problem = cells.pop("problem")
@@ -117,7 +123,13 @@ def _cells_of(row: SchemeResult | FlownScheme) -> Json:
 
 
 def _number_with_ends(name: str, number: ModelAndFlights) -> dict[str, float]:
-    """Return the cells of a number whose name ends in its unit."""
+    """Return the model's number, the flights' number with its interval, and their difference.
+
+    The values are keyed by column name.
+
+    Args:
+        name: name of the number, which ends in its unit.
+    """
     quantity, _, unit = name.rpartition("_")
     compared = name if unit == "ratio" else quantity
     return {
@@ -133,7 +145,7 @@ def _number_with_ends(name: str, number: ModelAndFlights) -> dict[str, float]:
 
 
 def model_lines(model: ModelReport, flights: FlightsReport | None = None) -> list[str]:
-    """Return the lines to print: the model's, and below them those of its flights, if any."""
+    """Return the report of the model as lines of text, followed by that of its flights if given."""
     lines = [
         f"Model {model.model}; knee: where velocity is "
         f"{100 * model.knee_velocity_over_roof_ratio:g} % of the roof",
@@ -387,7 +399,7 @@ _LABELS = {1: "one board", 2: "two boards (DMR)", 3: "three boards (TMR)"}
 
 
 def _draw_roofline(model: ModelReport) -> Figure:
-    """Draw safe velocity over action throughput, both logarithmic, with a panel per vehicle."""
+    """Draw safe velocity over action throughput on logarithmic axes, with a panel per vehicle."""
     vehicles = model.vehicles
     figure = new_figure(max(6.4, 4.9 * len(vehicles)), 4.9)
     panels = figure.subplots(1, len(vehicles), squeeze=False, sharey=True)[0]
@@ -462,7 +474,7 @@ _COST_WIDTH = 0.15
 
 
 def _draw_redundancy(model: ModelReport) -> Figure:
-    """Draw a panel per vehicle, with ratios to the reference as a bar per scheme."""
+    """Draw flight time and energy of each scheme over the reference, with a panel per vehicle."""
     vehicles = model.vehicles
     figure = new_figure(max(6.8, 4.6 * len(vehicles)), 4.2)
     panels = figure.subplots(1, len(vehicles), squeeze=False)[0]
@@ -514,9 +526,10 @@ _UPRIGHT: Look = {"va": "bottom", "fontsize": 7, "rotation": 90.0}
 
 
 def draw_flights(flights: FlightsReport) -> Figure:
-    """Draw a row per vehicle: velocities on the left, ratios to the reference on the right.
+    """Draw the flights of each vehicle beside the model's predictions, one row per vehicle.
 
-    A diamond marks the model. A bar shows the flights with their 95 % interval over missions.
+    Velocities are on the left, and ratios to the reference scheme on the right. A diamond marks the
+    model. A bar shows the flights with their 95 % interval over missions.
     """
     vehicles = flights.vehicles
     figure = new_figure(9.6, 1.0 + 3.1 * len(vehicles))
@@ -579,7 +592,11 @@ def _ratio_panel(axes: Axes, vehicle: FlownVehicle, reference: str) -> None:
 def _bar(
     axes: Axes, place: float, width: float, row: FlownScheme, number: ModelAndFlights | None
 ) -> None:
-    """Draw the flights' number as a bar and the model's as a diamond; None means not flown."""
+    """Draw the flights' number as a bar, and the model's as a diamond.
+
+    Args:
+        number: None if the scheme was not flown.
+    """
     if number is None:
         note_at(axes, "not flown", (place, 0.0), 3, **{**_UPRIGHT, "color": NOTE})
         return
@@ -595,4 +612,4 @@ MODEL_PICTURES: Mapping[str, Callable[[ModelReport], Figure]] = {
     "roofline.svg": _draw_roofline,
     "redundancy.svg": _draw_redundancy,
 }
-"""The pictures of the model, by file name."""
+"""The functions that draw the pictures of the model, keyed by file name."""

@@ -1,4 +1,4 @@
-"""Fills the page's template: formats the numbers and inserts the charts.
+"""Renders the HTML page of the report from its template, with formatted numbers and charts.
 
 The page is one file without a script. Its charts are SVG elements, which take font and colours from
 the page's style: light, dark or print.
@@ -24,7 +24,7 @@ _FOLDER = Path(__file__).parent
 
 
 def require_page(path: Path) -> None:
-    """Check, before the numbers are computed, that a page can be written.
+    """Check that the HTML page can be written to `path`, before its numbers are computed.
 
     Raises:
         MavfiError: jinja2, which the extra `report` installs, is missing.
@@ -36,7 +36,7 @@ def require_page(path: Path) -> None:
 
 
 def render(document: object) -> str:
-    """Render the page as one HTML text; equal values give equal pages.
+    """Render a document as one HTML page. Equal documents give equal pages.
 
     Args:
         document: `mavfi_cli.paper.document.Document`.
@@ -53,7 +53,7 @@ def render(document: object) -> str:
 
 
 def _unbroken(value: Any) -> Any:
-    """Keep a number and its per cent sign on one line."""
+    """Join each per cent sign in plain text to its number with a no-break space."""
     plain_text = isinstance(value, str) and not hasattr(value, "__html__")
     return value.replace(" %", "\N{NARROW NO-BREAK SPACE}%") if plain_text else value
 
@@ -62,7 +62,7 @@ def _unbroken(value: Any) -> Any:
 
 
 def _effect(effect: Interval, unit: str) -> str:
-    """Format an effect with its interval: a number, per cent, or points of a success rate."""
+    """Format an effect with its interval in a unit: `number`, `percent`, or `points` of a rate."""
     parts = (effect.value, effect.low, effect.high)
     if unit == "number":
         return with_ends(parts, "z.2f")
@@ -76,7 +76,7 @@ def _digits(largest: float) -> int:
 
 
 def _range(claim: Any) -> str:
-    """Format the range of a claim's effect."""
+    """Format the range that a claim gives for its effect, such as `at least 10 %`."""
     scale, unit = (1.0, "") if claim.unit == "number" else (100.0, _UNITS[claim.unit])
     low, high = (f"{scale * end:.4g}" for end in (claim.low, claim.high))
     if math.isinf(claim.low) and math.isinf(claim.high):
@@ -108,4 +108,4 @@ FILTERS: Mapping[str, Callable[..., Any]] = {
     "hourly": lambda rates: with_ends(rates, ".2g"),
     "shade": lambda share: f"{100 * math.sqrt(share):.0f}" if math.isfinite(share) else "0",
 }  # fmt: skip
-"""The template's filters, by the names that page.html uses."""
+"""The filters of the template, keyed by the names that page.html uses."""

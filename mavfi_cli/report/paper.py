@@ -1,4 +1,4 @@
-"""The form of the paper's items: tables of our numbers and the paper's, and figures for print."""
+"""Tables that compare our numbers with the paper's, and figures for print."""
 
 from __future__ import annotations
 
@@ -35,12 +35,13 @@ DETECTOR_TITLES = {"gad": "Gaussian", "aad": "autoencoder"}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperCell:
-    """Our number with its interval and count, and the paper's number.
+    """One cell of a table: our number with its interval and sample size, and the paper's number.
 
     Attributes:
-        value, low, high: NaN if there are none; a maximum has no interval.
-        count: number of missions, pairs or runs behind it.
-        paper: None if the paper prints nothing.
+        value, low, high: our number and the ends of its interval; NaN if there are none. A maximum
+            has no interval.
+        count: number of missions, pairs or runs behind our number.
+        paper: the paper's number, or its words for it; None if the paper prints nothing.
     """
 
     value: float = math.nan
@@ -51,7 +52,7 @@ class PaperCell:
 
     @classmethod
     def of_share(cls, share: Share, paper: Printed = None) -> PaperCell:
-        """Return the cell of a share, in per cent."""
+        """Return the cell for a share, converted to per cent."""
         if not share.total:
             return cls(paper=paper)
         ends = {"value": share.share, "low": share.low, "high": share.high}
@@ -59,24 +60,24 @@ class PaperCell:
 
     @classmethod
     def of_mean(cls, values: Sequence[float] | FloatArray, paper: Printed = None) -> PaperCell:
-        """Return the cell of a mean, with its bootstrap interval."""
+        """Return the cell for the mean of `values`, with its bootstrap interval."""
         return replace(cls.of_interval(interval(values, resamples=TABLE_RESAMPLES)), paper=paper)
 
     @classmethod
     def of_interval(cls, mean: Interval, scale: float = 1.0) -> PaperCell:
-        """Return the cell of a mean with its interval, both multiplied by `scale`."""
+        """Return the cell for a mean with its interval, both multiplied by `scale`."""
         ends = {"value": mean.value, "low": mean.low, "high": mean.high}
         return cls(**{k: scale * v for k, v in ends.items()}, count=mean.count)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperColumn:
-    """A column of numbers.
+    """The heading of a column of numbers, and the format of its numbers.
 
     Attributes:
         title: heading with the unit.
         digits: number of digits after the decimal point.
-        ends: digits of the interval's ends; None means `digits`.
+        ends: the same for the ends of intervals; None means `digits`.
         sign: whether positive numbers have a plus sign.
     """
 
@@ -86,11 +87,11 @@ class PaperColumn:
     sign: bool = False
 
     def formatted(self, value: float) -> str:
-        """Format a number for the column; a dash if there is none."""
+        """Format a number with the digits of the column. NaN and infinity become a dash."""
         return number(value, self._shape(self.digits))
 
     def ours(self, cell: PaperCell) -> str:
-        """Format our number with its interval."""
+        """Format our number in a cell, with its interval if it has one."""
         ends = self._shape(self.digits if self.ends is None else self.ends)
         return with_ends((cell.value, cell.low, cell.high), self._shape(self.digits), ends)
 
@@ -98,7 +99,7 @@ class PaperColumn:
         return f"{'+' if self.sign else ''}.{digits}f"
 
     def printed(self, paper: Printed) -> str:
-        """Format the paper's number for the column, or return the paper's words."""
+        """Format the paper's number like ours, or return the paper's words, which may be empty."""
         if isinstance(paper, float):
             return self.formatted(paper)
         return paper or ""
@@ -106,14 +107,14 @@ class PaperColumn:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperRow:
-    """One row: its labels, and a number for each column."""
+    """One row of a table: its labels, and one cell per column."""
 
     labels: tuple[str, ...]
     cells: tuple[PaperCell, ...]
 
     @property
     def count(self) -> str:
-        """Sample size of the row's numbers: one count, or the smallest and the largest."""
+        """Sample size of the row's numbers as text, or its range, such as `20 to 25`."""
         counts = sorted({cell.count for cell in self.cells if not math.isnan(cell.value)})
         if len(counts) < 2:
             return str(counts[0]) if counts else "0"
@@ -122,14 +123,14 @@ class PaperRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperTable:
-    """A table of the paper, or the numbers of one of its figures.
+    """A table of the paper, or the numbers behind one of its figures, with our numbers.
 
     Attributes:
-        name: name of the item, such as `table4`.
-        title: the paper's name for it, and what it shows.
-        labels: headings of the rows' labels.
+        name: name of the table or figure, such as `table4`.
+        title: the paper's name for the table or figure, and what it shows.
+        labels: headings of the columns with the rows' labels.
         notes: lines below the table.
-        result: the item's result in one line.
+        result: what the table shows, in one line.
     """
 
     name: str
@@ -141,11 +142,16 @@ class PaperTable:
     result: str = ""
 
     def printed_in(self, place: int) -> bool:
-        """Return whether the paper prints anything in a column."""
+        """Return True if the paper prints anything in the column with index `place`."""
         return any(row.cells[place].paper is not None for row in self.rows)
 
     def beside(self, row: PaperRow, place: int, unit: str = " %") -> str:
-        """Format our number in a row and a column, with the paper's in brackets if there is one."""
+        """Format our number in column `place` of a row, with the paper's in brackets if it has one.
+
+        Args:
+            place: index of the column.
+            unit: appended to both numbers.
+        """
         column, cell = self.columns[place], row.cells[place]
         paper = column.printed(cell.paper)
         return f"{column.formatted(cell.value)}{unit}" + (
@@ -153,13 +159,16 @@ class PaperTable:
         )
 
     def ranked(self, place: int) -> list[PaperRow]:
-        """Return the rows with a number in a column, the largest first."""
+        """Return the rows with a number in the column with index `place`, largest number first."""
         rows = [row for row in self.rows if not math.isnan(row.cells[place].value)]
         return sorted(rows, key=lambda row: -row.cells[place].value)
 
     @property
     def table(self) -> Table:
-        """Labels, n and our numbers, each on the same page as the paper's number."""
+        """The table as text cells: labels, sample size, and our numbers beside the paper's.
+
+        If it is split into pages, our number and the paper's stay on the same page.
+        """
         head = [*self.labels, "n"]
         parts = [1 + self.printed_in(place) for place in range(len(self.columns))]
         for column, part in zip(self.columns, parts, strict=True):
@@ -176,11 +185,11 @@ class PaperTable:
         )  # fmt: skip
 
     def formatted(self, form: str) -> str:
-        """Return the table in one of FORMATS; see `csv` for CSV."""
+        """Return the table as text in the format `form`, one of FORMATS; for CSV, see `csv`."""
         return self.csv() if form == "csv" else FORMATS[form](self.table)
 
     def csv(self) -> str:
-        """Return one number per line, in full precision."""
+        """Return the table as CSV with one line per number, in full precision."""
         return Table.of_records(
             {
                 "item": self.name,
@@ -225,10 +234,13 @@ def print_axes(axes: Axes, title: str = "") -> None:
 
 
 def draw_dots(table: PaperTable, columns: str = "one") -> Figure:
-    """Draw a panel per column of a table: our numbers with intervals, the paper's as diamonds.
+    """Draw each column of a table as a panel, with our numbers as dots and the paper's as diamonds.
+
+    Our numbers have their intervals.
 
     Args:
         table: has at least one row.
+        columns: width of the figure in columns of the printed page, `one` or `two`.
     """
     places = [
         place
@@ -260,10 +272,10 @@ def _panels(
     *,
     sharex: bool = False,
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure and its panels, which have the same rows.
+    """Return a new figure and its panels, one for each title, which have the same rows.
 
     Args:
-        names: names of the rows.
+        names: names of the rows, from top to bottom.
         panel_in, more_in: height of a panel, and of the rest of the figure.
     """
     panels = list(titles)
@@ -290,7 +302,7 @@ def _dot(axes: Axes, y: int, cell: PaperCell) -> None:
 
 
 def _explain(figure: Figure, ours: list[Any], paper: str, side: str, **spaces: Any) -> None:
-    """Add a legend with our mark, and the paper's mark if it has a label."""
+    """Add a legend for our marks and, unless its label `paper` is empty, for the paper's mark."""
     handles = ours + (figure.axes[0].plot([], [], label=paper, **_PAPER) if paper else [])
     look = {"loc": f"outside {side} center", "ncols": 2, "frameon": False, "fontsize": SMALLEST}
     figure.legend(handles=handles, **{**look, **spaces})
@@ -301,10 +313,10 @@ def _explain(figure: Figure, ours: list[Any], paper: str, side: str, **spaces: A
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Strip:
-    """The flights of one row of a panel.
+    """The flights that one row of a panel shows, as one value per flight.
 
     Attributes:
-        values: one for each flight, (n,).
+        values: one value for each flight, (n,).
         style: index into PALETTE.
         paper: the paper's largest value; None if it prints none.
     """
@@ -376,7 +388,7 @@ _HATCHES = ("", "////", "....", "")
 
 
 def draw_stack(table: PaperTable, columns: str = "one") -> Figure:
-    """Draw a bar of 100 per cent for each row, divided into the table's columns."""
+    """Draw each row of a table as a bar of 100 per cent, divided into the shares in its columns."""
     rows = len(table.rows)
     figure = new_figure(WIDTHS_IN[columns], 0.85 + 1.25 * _LINE_IN * rows)
     axes = figure.subplots()
@@ -403,7 +415,11 @@ def draw_stack(table: PaperTable, columns: str = "one") -> Figure:
 def draw_histograms(
     rows: Sequence[tuple[str, FloatArray, FloatArray]], columns: str = "one"
 ) -> Figure:
-    """Draw two histograms per row on one scale: values, and their deltas."""
+    """Draw a histogram of values and one of deltas in each row, both on the same scale.
+
+    Args:
+        rows: name of a state, its values (n,), and their deltas (m,).
+    """
     from matplotlib.ticker import NullFormatter
 
     figure = new_figure(WIDTHS_IN[columns], 0.35 + 0.95 * len(rows))

@@ -42,7 +42,7 @@ def _titles_of(plan: ComparedPlan) -> dict[str, str]:
 
 
 def platform_lines(comparison: PlatformComparison) -> list[str]:
-    """Return the comparison as text and tables."""
+    """Return the lines that report a comparison of platforms, as text and tables."""
     plan, settings = comparison.plan, comparison.settings
     lines = _head(plan)
     lines += ["", "Flights that count: golden, or with a fault that was read or caught; medians"]
@@ -111,7 +111,11 @@ def _side_by_side(
     *,
     by_setting: bool = False,
 ) -> list[str]:
-    """Return one line per platform and setting, grouped by platform or by setting."""
+    """Return the lines of a table with one row per platform and setting.
+
+    Args:
+        by_setting: whether rows are grouped by setting; otherwise they are grouped by platform.
+    """
     titles, last = _titles_of(plan), ""
     lines: list[list[str]] = []
     for row in rows:
@@ -130,7 +134,7 @@ def _against(
     title: str,
     columns: Columns[PairedRow],
 ) -> list[str]:
-    """Return one line per setting of a platform, compared with the reference."""
+    """Return a title and a table that compares a platform with the reference, a row per setting."""
     lines = [
         [_setting_title(row.setting), *(cell(row) for cell in columns.values())]
         for row in rows
@@ -251,7 +255,10 @@ _NUMBERS: Mapping[str, Sequence[tuple[str, str, str, str, str]]] = {
 
 
 def platform_csv(comparison: PlatformComparison) -> str:
-    """Return CSV text with one row per number: platform, setting, quantity, value and interval."""
+    """Return a comparison of platforms as CSV, with one row per number.
+
+    A row holds platform, setting, quantity, statistic, unit, value, interval and sample size.
+    """
     rows = [_NAMES]
     for table, numbers in _NUMBERS.items():
         title = "costs" if table == "cost_differences" else table
@@ -278,7 +285,13 @@ def _statistics(
 
 
 def _number_cells(value: Interval | Share | float, count: int | None) -> list[str]:
-    """Return value, ends of the interval and sample size; a missing one is empty."""
+    """Return the cells for a value, the ends of its interval and the sample size.
+
+    A missing number has an empty cell.
+
+    Args:
+        count: sample size of a value without an interval; None if unknown.
+    """
     if isinstance(value, Share):
         value = value.effect
     if isinstance(value, Interval):

@@ -21,7 +21,7 @@ UNPAIRED = (
 
 
 class SettingRow(NamedTuple):
-    """The labels and the name of a setting, and its cells in a table."""
+    """One row in a table of settings: the setting's labels and name, and its formatted cells."""
 
     labels: Labels
     name: str
@@ -30,11 +30,11 @@ class SettingRow(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SettingColumns:
-    """Columns and common labels of some settings.
+    """The label columns in a table of settings, and the labels that the settings share.
 
     Attributes:
-        keys: the labels that have a column, in order.
-        common: other labels, which have one value in all settings that have them.
+        keys: names of the labels that have a column, in display order.
+        common: the other labels, each with the one value that it has in all settings that have it.
     """
 
     keys: tuple[str, ...]
@@ -42,9 +42,9 @@ class SettingColumns:
 
     @classmethod
     def of(cls, settings: Sequence[Labels]) -> SettingColumns:
-        """Choose the columns that distinguish settings, and leave out their common labels.
+        """Choose the label columns that distinguish the settings; the other labels are common.
 
-        A single setting has no columns, because its name is enough.
+        A single setting has no label columns, because its name is enough.
         """
         if len(settings) == 1:
             return cls((), {})
@@ -60,25 +60,31 @@ class SettingColumns:
 
     @property
     def heads(self) -> tuple[str, ...]:
-        """Headings of the labels' columns."""
+        """The headings of the label columns, or of the column of names if there are none."""
         return self.keys or ("setting",)
 
     @property
     def notes(self) -> list[str]:
-        """The line above a table that lists the common labels; no line if there are none."""
+        """A line that lists the common labels, for above the table; empty if there are none."""
         return [f"in all settings that have it: {label_text(self.common)}"] if self.common else []
 
     def lines(self, head: Sequence[str], rows: Iterable[SettingRow]) -> list[str]:
-        """Return one line per setting, in several tables if one would be wider than WIDTH.
+        """Return the lines of a table with one row per setting.
+
+        If the table is wider than WIDTH, it is split into several tables.
 
         Args:
-            head: headings of the cells.
+            head: headings of the rows' `cells`.
         """
         table = [[*self.cells(row.labels, row.name), *row.cells] for row in rows]
         return Table([[*self.heads, *head], *table], labels=len(self.heads)).lines(WIDTH)
 
     def cells(self, labels: Labels, name: str) -> list[str]:
-        """Return the cells of a setting's labels; the first empty one has the rest of its name."""
+        """Return a setting's cells in the label columns.
+
+        The first empty cell holds the part of the name that the labels do not contain. Without
+        label columns, the only cell is the name.
+        """
         if not self.keys:
             return [name]
         cells = _cells(labels, self.keys)

@@ -45,7 +45,7 @@ def _number(value: float | None, unit: str, digits: int = 1, per: float = 1.0) -
 
 
 def outcome_line(flight: FlightRecord) -> str:
-    """Return the outcome and its reason in one line."""
+    """Return one line with the outcome of a flight, and the reason for it if one is recorded."""
     text = _OUTCOMES.get(flight.outcome, flight.outcome)
     if flight.programs:  # a user's companion has its own reasons for success and failure
         text = text.partition(":")[0]
@@ -53,7 +53,10 @@ def outcome_line(flight: FlightRecord) -> str:
 
 
 def summary_lines(flight: FlightRecord) -> list[str]:
-    """Return lines on outcome, mission, flight, faults, detection, response time and host time."""
+    """Return the lines of text that summarise a flight, folded at WIDTH characters.
+
+    They cover outcome, mission, flight, faults, nodes, detection, response time and host time.
+    """
     config = flight.config
     with_what = f"planner {config['planner']}, platform {config['platform']}"
     with_what += f", stack {config['stack']}"
@@ -200,7 +203,7 @@ def _detection_lines(detection: Detection | None, cost: DetectionCost | None) ->
 
 
 def folder_lines(run: Run, picture: Path | None) -> list[str]:
-    """Return the run folder, and the traceback and the picture if there are any."""
+    """Return lines with the paths of a run folder and, if they exist, its traceback and picture."""
     inside = "" if picture != run.folder.picture else f"  (see {run.folder.picture.name})"
     return [
         "",
@@ -211,9 +214,10 @@ def folder_lines(run: Run, picture: Path | None) -> list[str]:
 
 
 def run_html(run: Run) -> str:
-    """Return summary and picture as HTML; text is escaped, because the record is not trusted.
+    """Return the summary and the picture of a run as HTML.
 
-    The picture is drawn from the record and embedded as an image, in which browsers run no script.
+    The text is escaped, because the record is not trusted. The picture is drawn from the record and
+    embedded as an image, in which browsers run no script.
     """
     from mavfi_cli.report.drawing import svg
     from mavfi_cli.report.top_view import draw_top_view
@@ -227,7 +231,7 @@ def run_html(run: Run) -> str:
 
 
 def event_lines(flight: FlightRecord) -> list[str]:
-    """Return one line per event with its simulated time."""
+    """Return one line per event of a flight, with its simulated time, kind and text."""
     return [f"{e.stamp_s:9.2f} s  {e.kind:<10} {e.text}" for e in flight.events]
 
 
@@ -267,7 +271,7 @@ def _fault_lines(flight: FlightRecord) -> list[str]:
 
 
 def _activation(activation: RecordedActivation) -> str:
-    """Return the activation: whether any node read the corrupted value."""
+    """Describe which node first read the corrupted value, or why no node read it."""
     reader = activation.first_reader
     if reader is not None:
         return f"first read by {reader.name} at {reader.stamp_s:.2f} s ({reader.state})"
@@ -309,7 +313,7 @@ def _instruction_lines(fault: MissionInstructionFault) -> list[str]:
 
 
 def _place(fault: MissionInstructionFault) -> str:
-    """Return the place of an instruction: function and offset, or offset in its object."""
+    """Describe the location of the struck instruction: offset in a function, or in an object."""
     if not fault.symbol:
         return f"{fault.object}+{fault.offset:#x}"
     name, _, offset = fault.symbol.partition("+")
@@ -329,7 +333,11 @@ def _change_line(stamp_s: float, change: Change) -> str:
 
 
 def _formatted(value: Scalar | None, pattern: str, other: Scalar | None) -> str:
-    """Format a value. Infinities and NaN, which JSON lacks, are decoded from their bits."""
+    """Format a value so that it can be distinguished from `other`.
+
+    JSON has no infinities and NaN, so the record holds None for them. They are decoded from their
+    bits, `pattern`.
+    """
     if value is None:
         return {"0x7ff0000000000000": "inf", "0xfff0000000000000": "-inf"}.get(
             pattern, f"nan {pattern}"
@@ -338,7 +346,7 @@ def _formatted(value: Scalar | None, pattern: str, other: Scalar | None) -> str:
 
 
 def difference_lines(run: Run, golden: Run) -> list[str]:
-    """Compare a run with its golden run: first difference, deviation and outcome."""
+    """Describe how a run differs from its golden run: first difference, path, time and outcome."""
     parting = run.first_difference(golden)
     ours, theirs = run.record, golden.record
     fault = ours.fault

@@ -25,16 +25,18 @@ _LEAST_ROOM = 20  # characters; minimum width of the prose column
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of formatted cells; the headings, if there are any, come first.
+    """A table of formatted cells, which can be written in each of FORMATS.
 
     Attributes:
-        rows: may differ in length; missing cells are empty.
-        labels: number of left-aligned columns; the others are right-aligned. None aligns all left.
-        kept: number of columns after the labels that, like these, every page of a wide table
-            repeats.
-        parts: sizes of the groups of other columns that stay on one page; empty if every column is
-            a group of its own.
-        prose: whether the last column is wrapped at the width.
+        rows: the headings, if there are any, come first. Rows may differ in length; missing cells
+            are empty.
+        labels: number of left-aligned columns at the start; the other columns are right-aligned.
+            None aligns all columns left.
+        kept: number of columns after the labels that are repeated, like the labels, on every page
+            of a wide table.
+        parts: sizes of the groups of remaining columns that stay together on one page; empty if
+            every column is a group of its own.
+        prose: whether the last column is wrapped at the width of the table.
         name: label of a LaTeX table.
         title: caption.
         notes: lines below the table.
@@ -51,7 +53,9 @@ class Table:
 
     @classmethod
     def of_records(cls, records: Iterable[Mapping[str, Any]], names: Sequence[str] = ()) -> Self:
-        """Return a table with one row per record below the column names; numbers are not rounded.
+        """Return a table with the column names as headings, and one row per record.
+
+        Numbers are not rounded. A cell is empty if its record has no value.
 
         Args:
             names: names of the columns; if empty, the keys of all records, in order.
@@ -79,12 +83,12 @@ class Table:
         return lines
 
     def text(self) -> str:
-        """Return title, aligned columns and notes."""
+        """Return the table as plain text: title, aligned columns and notes."""
         lines = [*([self.title] if self.title else []), *self.lines(WIDTH), *self.notes]
         return "\n".join(map(printable, lines)) + "\n"
 
     def markdown(self) -> str:
-        """Return a table with pipes, below the title in bold."""
+        """Return the table in Markdown: the title in bold, rows with pipes, and the notes."""
         head, *rows = self._padded()
         rules = ["---" if left else "---:" for left in self._left(len(head))]
         lines = [
@@ -95,7 +99,7 @@ class Table:
         return "\n".join(map(printable, [*title, *lines, "", *self.notes])).rstrip() + "\n"
 
     def latex(self) -> str:
-        """Return a float with a plain tabular, which needs no package.
+        """Return the table as a LaTeX float with a plain tabular, which needs no package.
 
         It is as wide as one column of a two-column page, or as the whole page, in the largest font
         size that fits.
@@ -121,13 +125,15 @@ class Table:
         return "\n".join(lines) + "\n"
 
     def csv(self) -> str:
-        """Return one line per row, without title and notes."""
+        """Return the table as CSV with one line per row, without title and notes."""
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(self._padded())
         return text.getvalue()
 
     def html(self, *, bare: bool = False) -> str:
-        """Return a table element with escaped cells; cells of numbers have the class `n`.
+        """Return the table as an HTML element with escaped cells, followed by the notes.
+
+        Right-aligned cells have the class `n`.
 
         Args:
             bare: leave out title and notes.
@@ -156,7 +162,10 @@ class Table:
         return [self.labels is None or place < self.labels for place in range(columns)]
 
     def _wrapped(self, width: int) -> list[list[str]]:
-        """Return the rows, with additional ones for prose that continues on further lines."""
+        """Return the rows of cells with the last column wrapped, so that the table fits the width.
+
+        The continuation of a wrapped cell is an additional row, whose other cells are empty.
+        """
         cells = self._padded()
         room = width - sum(column + _GAP for column in _widths(cells)[:-1])
         rows = []
@@ -166,7 +175,7 @@ class Table:
         return rows
 
     def _pages(self, widths: Sequence[int], kept: int, width: int) -> Iterator[tuple[int, int]]:
-        """Yield the first column of each page and the column after its last."""
+        """Yield the index of the first column of each page, and the index after its last column."""
         own = sum(column + _GAP for column in widths[:kept])
         first, end, used = kept, kept, own
         for columns in self.parts or [1] * (len(widths) - kept):
@@ -224,7 +233,11 @@ _PLACES = (("table", 252.0), ("table*", 516.0))
 
 
 def _latex_place(widths: Sequence[int]) -> tuple[str, str, float]:
-    """Return float, font size and column gap: the narrowest float that fits, else the last."""
+    """Return the LaTeX float, font size and gap between columns (points) for the column widths.
+
+    Combinations are tried from the narrowest float and the largest font. The result is the first
+    one in which the columns fit, or the last one if they fit in none.
+    """
     for place, width_pt in _PLACES:
         for size, character_pt, gap_pt in _SIZES:
             if sum(widths) * character_pt + len(widths) * gap_pt <= width_pt:
@@ -244,12 +257,12 @@ def _latex(text: str) -> str:
 
 
 def number(value: float, shape: str = "", scale: float = 1.0, unit: str = "") -> str:
-    """Format a value with its unit; a dash if it is not finite."""
+    """Format a value times `scale`, with its unit. A value that is not finite becomes a dash."""
     return "-" if not math.isfinite(value) else f"{scale * value:{shape}}{unit}"
 
 
 def percent(share: float, shape: str = ".1f") -> str:
-    """Format a share in per cent."""
+    """Format a share in per cent, such as `25.0 %` for 0.25."""
     return number(share, shape, 100.0, " %")
 
 
@@ -262,12 +275,13 @@ def with_ends(
     unit: str = "",
     chance: float | None = None,
 ) -> str:
-    """Format a value, with the ends of its interval and a p-value if it has them.
+    """Format an estimate, with the ends of its interval and its p-value in brackets, if known.
 
     Args:
-        estimate: value, low, high.
+        estimate: value, low end and high end; a NaN low end means that the interval is unknown.
         shape: format of the value.
         ends: format of the ends; empty means that of the value.
+        chance: the p-value; None if unknown.
     """
     value, low, high = (scale * part for part in estimate)
     if not math.isfinite(value):
@@ -278,10 +292,11 @@ def with_ends(
 
 
 def rate(share: Share, digits: int = 1, ends: int = 0) -> str:
-    """Format a share in per cent with its interval.
+    """Format a share in per cent, with the ends of its interval in brackets.
 
     Args:
-        ends: digits of the ends of the interval.
+        digits: number of decimals of the share.
+        ends: number of decimals of the ends of the interval.
     """
     return with_ends(
         (share.share, share.low, share.high), f".{digits}f", f".{ends}f", scale=100.0, unit=" %"
@@ -295,11 +310,15 @@ def spread(
     sign: str = "",
     chance: float | None = None,
 ) -> str:
-    """Format a value with its interval and p-value if there are any."""
+    """Format a value, with the ends of its interval and its p-value in brackets, if known.
+
+    Args:
+        chance: the p-value; None if unknown.
+    """
     shape = f"{sign or 'z'}.{digits}f"  # the sign of -0.00 shows its side of zero
     return with_ends((value.value, value.low, value.high), shape, scale=scale, chance=chance)
 
 
 def p_value(chance: float) -> str:
-    """Format a p-value in short form."""
+    """Format a p-value in short form, such as `p .03` or `p<.001`."""
     return "p<.001" if chance < 0.001 else f"p {chance:.1g}".replace("p 0.", "p .")

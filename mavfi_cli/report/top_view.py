@@ -60,7 +60,10 @@ _FROM_ABOVE, _OVER_TIME = [1, 2], [0, 3]  # columns of stamp, x, y, z that axes 
 
 
 def draw_top_view(run: Run) -> Figure:
-    """Draw a figure of the run in metres: east to the right and north up, and height over time."""
+    """Draw the flight of a run from above, with east to the right and north up, and its height.
+
+    Lengths are in metres. The height is drawn over time.
+    """
     figure = new_figure(5.6, 7.0)
     figure.get_layout_engine().set(h_pad=0.1, w_pad=0.08)  # type: ignore[union-attr, call-arg]
     axes, beside = figure.subplots(2, height_ratios=[4.2, 1.0])
@@ -89,7 +92,7 @@ _Path = tuple[np.ndarray, np.ndarray]  # (n, 4) stamp in s and position in m; sp
 
 
 def _path_of(run: Run) -> _Path:
-    """Return the path of a flight, from the true states if they are known."""
+    """Return the stamps, positions and speeds of a flight, from the true states if recorded."""
     trace = run.trace
     if trace is None or trace.num_rows == 0:
         return np.empty((0, 4)), np.empty(0)
@@ -105,7 +108,11 @@ def _path_of(run: Run) -> _Path:
 
 
 def _draw_obstacles(axes: Axes, world: Json, positions: np.ndarray) -> None:
-    """Draw the boxes of a world; those that end below the positions (n, 3), m, are pale."""
+    """Draw the boxes of a world from above. Boxes that end below the flight are pale.
+
+    Args:
+        positions: positions of the vehicle, (n, 3), m.
+    """
     from matplotlib.patches import Rectangle
 
     flight_height_m = float(np.median(positions[:, 2])) if len(positions) else 5.0
@@ -134,7 +141,7 @@ def _draw_plans(axes: Axes, plans: Sequence[RecordedPlan]) -> None:
 def _draw_path(
     axes: Axes, path: np.ndarray, speeds_mps: np.ndarray, columns: list[int], v_max_mps: float
 ) -> Any:
-    """Draw the path coloured by speed. Return its lines; None without a path."""
+    """Draw a path coloured by speed. Return its lines, or None if it has fewer than two points."""
     from matplotlib.collections import LineCollection
 
     step = max(1, len(path) // 400)
@@ -174,7 +181,7 @@ def _draw_end(
     columns: list[int] = _FROM_ABOVE,
     colour: str = FAULT,
 ) -> None:
-    """Mark the end of a failed flight."""
+    """Mark the end of a flight with its outcome if it failed."""
     if not flight.succeeded:
         _mark(axes, path[-1:], columns, flight.outcome, "X", s=90, color=colour, zorder=7)
 
@@ -187,7 +194,12 @@ def _draw_start(axes: Axes, path: np.ndarray, columns: list[int] = _FROM_ABOVE) 
 def _mark(
     axes: Axes, places: np.ndarray, columns: list[int], label: str, marker: str, **look: Any
 ) -> np.ndarray:
-    """Mark places (n, 4), and return their coordinates on the axes, (n, 2)."""
+    """Draw a mark at each place, and return the coordinates of the marks on the axes, (n, 2).
+
+    Args:
+        places: stamp in s and position in m, (n, 4).
+        columns: the two columns of `places` that the axes show.
+    """
     projected: np.ndarray = places[:, columns]
     if len(places):
         style = {"edgecolors": "white", "linewidths": 0.8, "marker": marker, **look}
@@ -202,7 +214,10 @@ def _draw_marks(
     columns: list[int] = _FROM_ABOVE,
     **style: Any,
 ) -> np.ndarray:
-    """Mark events of a kind and return their places (n, 2). `style` overrides the mark."""
+    """Mark the events of one kind, and return the coordinates of the marks on the axes, (n, 2).
+
+    Events without a position are omitted. `style` overrides the usual style of the mark.
+    """
     stamped = [
         (event.stamp_s, *event.position_enu_m)
         for event in events
@@ -270,7 +285,7 @@ def _caption(figure: Figure, axes: Axes, flight: FlightRecord) -> None:
 
 
 def _treatment(flight: FlightRecord) -> list[str]:
-    """Return the fault and the detector of a flight; nothing if it has neither."""
+    """Return lines that describe the fault and the detector of a flight, if it has any."""
     parts = []
     if (fault := flight.fault) is not None:
         missed = " (not injected)" if fault.state == "not_injected" else ""
@@ -282,7 +297,7 @@ def _treatment(flight: FlightRecord) -> list[str]:
 
 
 def _struck(flight: FlightRecord) -> str:
-    """Return the fault in words, with the state or the node that was drawn."""
+    """Describe the fault of a flight in words, with the state or the node that was drawn for it."""
     if (instruction := flight.instruction_fault) is not None:
         return InstructionConfig(**instruction.request).describe(instruction.node)
     assert flight.state_fault is not None
@@ -298,19 +313,20 @@ _Flights = Sequence[tuple[str, Run]]
 
 @dataclass(frozen=True, slots=True)
 class Trajectories:
-    """Panels of superimposed flights. A name has the same colour in all panels.
+    """A picture of the flights of one mission, superimposed in one or more panels.
 
-    The first flight without fault and detector is the reference for the times of the others.
+    Flights with the same name have the same colour in all panels. The first flight in a panel that
+    has no fault and no detector is the reference for the times of the others.
 
     Attributes:
-        panels: At least one, each with its title and at least one flight.
+        panels: At least one panel, each with its title and at least one named flight.
     """
 
     panels: Sequence[tuple[str, _Flights]]
 
     @classmethod
     def of(cls, picture: MissionPicture) -> Trajectories:
-        """Read the run folders of a picture.
+        """Load the runs of a picture from their run folders.
 
         Raises:
             RecordError: A run folder cannot be read.
@@ -321,7 +337,7 @@ class Trajectories:
         ])  # fmt: skip
 
     def draw(self, across: int = _COLUMNS) -> Figure:
-        """Draw a top view per panel, in metres, east to the right and north up.
+        """Draw a top view per panel, in metres, with east to the right and north up.
 
         Args:
             across: Maximum number of panels side by side.
@@ -346,7 +362,7 @@ class Trajectories:
         return figure
 
     def lines(self) -> list[str]:
-        """Describe the picture: world and seed, and outcome, time and folder of every flight."""
+        """Return lines with world and seed, and with outcome, time and folder of every flight."""
         text = [self._place]
         for title, flights in self.panels:
             text += [f"fault: {title}"] if title else []
@@ -363,7 +379,11 @@ class Trajectories:
 
 
 def _colours(flights: Iterable[tuple[str, Run]]) -> dict[str, str]:
-    """Return a colour per name: its detector's if still unused, else the next of FLIGHTS."""
+    """Return the colour of each flight, keyed by name.
+
+    It is the colour of the flight's detector if no other name has it yet; otherwise it is the next
+    one of FLIGHTS.
+    """
     colours: dict[str, str] = {}
     turn = itertools.cycle(FLIGHTS)
     for name, run in flights:

@@ -33,20 +33,20 @@ def _require_range(key: str, value: float | None, low: float, high: float) -> No
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProgramConfig:
-    """One program of a companion.
+    """One program of a user's companion: how mavfi starts, awaits and restarts it.
 
     Attributes:
         command: Command line. Placeholders in braces are filled in.
         folder: Working folder, relative to the file of the companion.
         environment: Variables added to mavfi's own environment.
-        restart: When to restart it after it has ended: never, on-failure or always.
-        restart_s: Wall-clock time from its end to its restart, s.
-        ready_line: Regular expression for a line on stdout after which it is ready.
-        ready_port: TCP port of this machine that it opens when it is ready.
-        ready_heartbeat: It is ready when its first MAVLink heartbeat arrives.
-        ready_limit_s: Longest wall-clock time until it is ready, s.
-        share: Share of the time for which it runs; below 1 it is stopped for the rest of every
-            20 ms, as on a slower computer.
+        restart: When to restart the program after it has ended: never, on-failure or always.
+        restart_s: Wall-clock time from the program's end to its restart, s.
+        ready_line: Regular expression for a line on stdout after which the program is ready.
+        ready_port: TCP port of this machine that the program opens when it is ready.
+        ready_heartbeat: The program is ready when its first MAVLink heartbeat arrives.
+        ready_limit_s: Longest wall-clock time until the program is ready, s.
+        share: Share of the time for which the program may run. Below 1, it is stopped for the rest
+            of every 20 ms, as on a slower computer.
     """
 
     command: str
@@ -75,10 +75,10 @@ class ProgramConfig:
             raise ConfigError(f"must be a regular expression: {error}", key="ready_line") from None
 
     def argv(self, values: Mapping[str, str]) -> list[str]:
-        """Return the words of the command with the placeholders filled in.
+        """Split the command into words, and replace each placeholder with its value in `values`.
 
         Raises:
-            UnknownName: A word in braces is not a placeholder. The message suggests the nearest.
+            UnknownName: A name in braces is not a key of `values`. The error suggests the nearest.
         """
 
         def filled(match: re.Match[str]) -> str:
@@ -98,12 +98,14 @@ def _words(command: str) -> list[str]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SuccessConfig:
-    """The conditions of success. All that are given must hold, and no collision may occur.
+    """The conditions under which a flight of a user's companion is a success.
+
+    All conditions that are set must hold, and no collision may occur.
 
     Attributes:
         goal_m: The vehicle is at rest within this distance of the goal, m.
         landed: The vehicle stands on the ground, disarmed, after a flight.
-        exit: This program has ended with code 0.
+        exit: Name of a program that must have exited with code 0.
         corridor_m: The vehicle was never farther than this from the path of `golden`, m.
         golden: Run folder of the flight whose path `corridor_m` refers to.
     """
@@ -119,23 +121,24 @@ class SuccessConfig:
         _require_range("corridor_m", self.corridor_m, 0.01, 1e4)
         if (self.corridor_m is None) != (self.golden is None):
             raise ConfigError(
-                "corridor_m and golden (a run folder) must be given together", key="corridor_m"
+                "must be given together with golden, the run folder of the flight to stay close to",
+                key="corridor_m",
             )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateConfig:
-    """The behaviour of the gate between a companion and its autopilot.
+    """How the gate between a user's companion and the autopilot reacts to alarms and errors.
 
     Attributes:
         action: What replaces a setpoint that raises an alarm: `hold`, the last accepted setpoint;
             `brake`, a standstill; `autopilot`, nothing, and the autopilot is switched to its own
             hold.
         patience: Number of consecutive alarms after which `hold` becomes `brake`.
-        stale_s: Time without a change after which setpoints are withheld if their companion has
-            ended or is silent, s.
+        stale_s: Time after which setpoints that no longer change are withheld if the companion
+            has ended or is silent, s.
         on_error: Whether setpoints pass (`open`) or not (`closed`) after an error in the gate.
-        watch_only: Report alarms, and withhold nothing.
+        watch_only: Report alarms, but withhold nothing.
     """
 
     action: str = ACTIONS[0]
@@ -155,7 +158,7 @@ class GateConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompanionConfig:
-    """A companion: its programs by name, its link, and its conditions of success.
+    """A user's companion: its programs keyed by name, its MAVLink link and its success conditions.
 
     Attributes:
         program: Programs in the order in which they start; each waits until the one before is
@@ -166,14 +169,14 @@ class CompanionConfig:
         link: mavfi's end of the companion's MAVLink link. By default it listens on a free
             port: UDP with the wall clock, TCP in lockstep. `udpout` connects to a program that
             listens on a fixed port, as PX4 does.
-        success: Conditions of success; by default the last program has ended with code 0.
+        success: Conditions of success. By default, the last program must have exited with code 0.
         time_limit_s: Limit of simulated time from arming, s; None for the mission's.
         flight_s: Simulated time from arming over which random faults are drawn, s; None for the
             duration of a straight flight to the goal at the speed limit.
         key_file: File with the signing passphrase of the link, relative to this file. A message
             that a fault changes is signed again with it.
         gate: Behaviour of the gate with `--detector`.
-        name: Name that the models of its detectors store.
+        name: Name of the companion, which detector models that are fitted to it store.
         own_network: In a campaign, each mission has a network of its own with only a loopback, if
             the operating system allows it, so that fixed ports do not collide.
     """
@@ -214,16 +217,22 @@ class CompanionConfig:
             object.__setattr__(self, "success", last)
 
     def _check_lockstep(self) -> None:
-        """Reject settings that depend on the wall clock or on a second program."""
+        """Reject settings that lockstep does not support.
+
+        These are links other than `tcpin`, a second program, and settings that need the wall clock.
+        """
         if not self.url.startswith("tcpin:"):
-            raise ConfigError("must be tcpin: in lockstep, because UDP may lose ticks", key="link")
+            raise ConfigError("must be a tcpin: URL in lockstep; UDP may lose ticks", key="link")
         if len(self.program) > 1:
-            raise ConfigError("must be a single program in lockstep", key="program")
+            raise ConfigError("must contain only one program in lockstep", key="program")
         plain = ProgramConfig(command="true")
         for name, program in self.program.items():
             for key in ("restart", "ready_line", "ready_port", "ready_heartbeat", "share"):
                 if getattr(program, key) != getattr(plain, key):
-                    raise ConfigError("needs time = 'wall'", key=f"program.{name}.{key}")
+                    raise ConfigError(
+                        "has no effect in lockstep; set time = 'wall' or remove it",
+                        key=f"program.{name}.{key}",
+                    )
 
     @property
     def in_lockstep(self) -> bool:
@@ -238,24 +247,27 @@ class CompanionConfig:
 
     @property
     def mark(self) -> StackMark:
-        """Identity of the companion for the models of its detectors: its name and commands."""
+        """Identity that detector models of this companion store: its name, and a digest.
+
+        The digest is that of the programs' names and commands.
+        """
         commands = {name: program.command for name, program in self.program.items()}
         digest = hashlib.sha256(json.dumps(commands).encode()).hexdigest()
         return StackMark(name=f"{COMPANION}{self.name}", digest=digest)
 
     def uses(self, placeholder: str) -> bool:
-        """Return True if the command of any program contains this placeholder."""
+        """Return True if the command of any program contains `placeholder` in braces."""
         return any(
             placeholder in _PLACEHOLDER.findall(own.command) for own in self.program.values()
         )
 
     @classmethod
     def load(cls, given: str) -> CompanionConfig:
-        """Load a companion from a TOML file, or build one from a command line.
+        """Load a companion from the TOML file `given`, or build one that runs `given` as a command.
 
         Raises:
             ConfigError: The file cannot be used, or a program cannot be started.
-            UnknownName: A name in it does not exist.
+            UnknownName: A name in the file does not exist.
         """
         path = Path(given)
         if path.suffix == ".toml":
@@ -275,7 +287,7 @@ class CompanionConfig:
 
 
 def _require_startable(name: str, program: ProgramConfig) -> None:
-    """Reject a program that does not exist, or that mavfi could not end."""
+    """Reject a program whose folder or executable is missing, or that is set-uid or set-gid."""
     word = _words(program.command)[0]
     if not Path(program.folder).is_dir():
         raise ConfigError(f"no such folder: {program.folder}", key=f"program.{name}.folder")

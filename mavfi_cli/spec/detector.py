@@ -25,24 +25,24 @@ COMPANION = "companion:"
 
 
 class _NoModel(ModelError):
-    """A missing option that names a model, which is a usage error."""
+    """The option that names the model is missing, which is a usage error."""
 
     exit_code = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorConfig:
-    """The detector of a mission.
+    """The detector of a mission: its model, its threshold and the states that it watches.
 
     Attributes:
         name: gad, aad, range, l2 or the name of a plug-in.
         protect: Stages whose states are watched.
-        threshold: Replaces the model's threshold; a number of sigmas for gad.
+        threshold: Threshold that replaces the model's; for gad, a number of sigmas.
         model: Path of a model file; None selects the one shipped for the mission's stack.
         alarms_max: Number of consecutive alarms in planning or control after which the vehicle
             holds and replans; also the maximum number of consecutive reports that are withheld.
         any_stack: Allow a model that was fitted to another stack.
-        watch: Watched states: `paper` for the 13 states, `extended` adds three more.
+        watch: Watched states: `paper` for the paper's 13 states, `extended` for three more.
     """
 
     name: str
@@ -76,10 +76,12 @@ class DetectorConfig:
     def with_model(
         cls, name: str, models: Path | None, protect: tuple[str, ...] = STAGES
     ) -> DetectorConfig:
-        """Configure a detector with the model NAME.json in `models`, or the shipped one if None.
+        """Configure the detector `name` with the model file NAME.json in the folder `models`.
+
+        If `models` is None, the detector uses the model shipped for the mission's stack.
 
         Raises:
-            ModelError: The folder has no such file.
+            ModelError: The folder does not contain NAME.json.
         """
         path = None if models is None else models.absolute() / f"{name}.json"
         if path is not None and not path.is_file():
@@ -87,10 +89,10 @@ class DetectorConfig:
         return cls(name=name, protect=protect, model=None if path is None else str(path))
 
     def model_path(self, stack: str) -> Path | None:
-        """Return the model file; None if the detector has no model.
+        """Return the path of the model file, or None if the detector has no model.
 
-        It is the configured file, or else the one shipped for the stack or for its nearest base
-        stack. `build` rejects the model of a base stack without `any_stack`.
+        The file is the configured one, or else the one shipped for the stack or for its nearest
+        base stack. `build` rejects the model of a base stack unless `any_stack` is set.
 
         Args:
             stack: Stack of the mission, as for `load_stack`, whose errors are raised too.
@@ -107,7 +109,10 @@ class DetectorConfig:
         return None
 
     def model_digest(self, stack: str) -> str:
-        """Return the digest of the model file; `none` without one. Errors as in `model_path`."""
+        """Return the digest of the model file, or "none" if the detector has no model.
+
+        Raises the same errors as `model_path`.
+        """
         path = self.model_path(stack)
         return "none" if path is None else file_digest(path)
 
@@ -181,7 +186,7 @@ class DetectorConfig:
         return detector
 
     def extended_ranges(self, detector: Detector) -> Ranges | None:
-        """Return the ranges of the extended states in the model; None if they are not watched.
+        """Return the model's ranges of the extended states, or None if they are not watched.
 
         Raises:
             ConfigError: The model lacks ranges of the extended states.

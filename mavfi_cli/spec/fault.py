@@ -41,7 +41,7 @@ _QUEUED = [name for name in dict.fromkeys((*BY_NAME, *GROUPS)) if name.startswit
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FaultConfig:
-    """One source-level fault of a mission.
+    """The configuration of one source-level fault of a mission.
 
     Attributes:
         target: Injection site: a stage, a state or a group of states; `detector` or `detector.PART`
@@ -51,7 +51,7 @@ class FaultConfig:
             of an array, or `MESSAGE`; `output.` or `input.` before it selects a direction.
         seed: Root seed of the fault's random streams.
         at: Trigger: "random", "time=SECONDS", "tick=N", "phase=NAME", "foreseen" or "invocation=N".
-        together: Corrupt all components of the group at once.
+        together: Corrupt all components of the target's group at once.
         exact_bits: Bits to flip instead of randomly drawn ones.
     """
 
@@ -77,13 +77,16 @@ class FaultConfig:
 
     @property
     def killed_node(self) -> str | None:
-        """Node whose process is killed; None for a fault in a value."""
+        """Name of the node or program whose process is the target, or None for other targets."""
         what, dot, node = self.target.partition(".")
         return node if what == PROCESS and dot else None
 
     @property
     def wire_target(self) -> tuple[str | None, str] | None:
-        """Direction (None: any) and MESSAGE[.FIELD] of a fault in MAVLink messages; else None."""
+        """Direction and MESSAGE[.FIELD] of a fault in MAVLink messages, or None for other faults.
+
+        The direction is "output" or "input", or None if the fault strikes both.
+        """
         first, _, rest = self.target.partition(".")
         direction, target = (first, rest) if first in DIRECTIONS else (None, self.target)
         return (direction, target) if direction or target[:1].isupper() else None
@@ -95,7 +98,7 @@ class FaultConfig:
 
     @property
     def detector_part(self) -> str | None:
-        """Array of the detector's memory to corrupt; None to draw one."""
+        """Name of the array in the detector's memory to corrupt, or None to draw one at random."""
         return self.target.partition(".")[2] or None
 
     def describe(self, struck: str | None = None) -> str:
@@ -135,7 +138,7 @@ class FaultConfig:
         return ", ".join([what, *held, *when])
 
     def check(self) -> None:
-        """Validate the configuration. Raises the same errors as `draw`."""
+        """Validate the configuration. Raises the same errors as `draw` and `draw_wire`."""
         if self.wire_target is not None:
             self.draw_wire()
         elif self.killed_node is not None:
@@ -160,11 +163,11 @@ class FaultConfig:
             raise FaultSpecError(f"{self.target}: at must be a time, tick or phase, got {self.at}")
 
     def check_program(self, programs: Collection[str]) -> None:
-        """Validate the fault in a process of a user's companion, given its programs.
+        """Check that the fault is possible in a process of a companion with these `programs`.
 
         Raises:
             UnknownName: No program or effect has this name.
-            FaultSpecError: This effect or trigger is impossible for a process.
+            FaultSpecError: A process cannot have this effect, trigger or persistence.
         """
         name = self.killed_node
         if name not in programs:
@@ -174,18 +177,19 @@ class FaultConfig:
         self._check_trigger_of_process()
         if corruption.persistence is not Persistence.TRANSIENT:
             raise FaultSpecError(
-                f"{self.target}: persistence must be transient, got {self.persistence}"
+                f"{self.target}: a fault in a process must be transient, got {self.persistence}"
             )
 
     def draw_wire(self) -> tuple[WireFields, SourceFault | None]:
-        """Draw the fault in a MAVLink message.
+        """Draw the fields and bits that a fault in MAVLink messages corrupts.
 
         Returns:
-            The message, and the fault in its fields; None if the message itself is struck.
+            The fields of the targeted message type, and the drawn fault in them. The fault is None
+            if its effect strikes whole messages.
 
         Raises:
-            UnknownName: No message or field has this name. The message suggests the nearest.
-            FaultError: Values contradict each other.
+            UnknownName: No message or field has this name. The error suggests the nearest.
+            FaultError: Settings contradict each other.
         """
         from mavfi_cli.link.fields import WireFields  # loads pymavlink
 
@@ -216,7 +220,7 @@ class FaultConfig:
         """Reject a trigger beyond the mission's time limit. Also raises the errors of `trigger`.
 
         Raises:
-            FaultSpecError: The time or the tick is beyond the limit.
+            FaultSpecError: The time or tick of the trigger is beyond the limit.
         """
         trigger = self.trigger()
         at_s = trigger.number * _UNIT_S.get(trigger.when, 0.0)
@@ -227,7 +231,7 @@ class FaultConfig:
             )
 
     def trigger(self) -> Trigger:
-        """Parse the trigger.
+        """Parse `at`, and return the trigger that it describes.
 
         Raises:
             UnknownName: The kind of trigger or the phase does not exist.
@@ -255,7 +259,12 @@ class FaultConfig:
             ) from None
 
     def corruption(self) -> Corruption:
-        """Build the corruption. Raises UnknownName or FaultSpecError if a setting is invalid."""
+        """Build the corruption from the effect, the bits and the persistence.
+
+        Raises:
+            UnknownName: No effect, bit field or persistence has this name.
+            FaultSpecError: A number is missing or invalid.
+        """
         effect, _, amount = self.effect.partition("=")
         try:
             number = float(amount or 0.0)
@@ -272,11 +281,11 @@ class FaultConfig:
         )
 
     def draw(self) -> SourceFault:
-        """Draw the injection site and return the fault in an inter-kernel state.
+        """Draw the injection site from the target, and return the fault in that monitored state.
 
         Raises:
-            UnknownName: A name does not exist.
-            FaultError: Values contradict each other.
+            UnknownName: The target, or another name in the configuration, does not exist.
+            FaultError: Settings contradict each other.
         """
         target = self.target
         if self.strikes_queue:
@@ -298,7 +307,10 @@ class FaultConfig:
 
 
 def target_names(*, instruction: bool = False) -> list[str]:
-    """Return the names of all injection sites at instruction level or at source level."""
+    """Return the names of all source-level injection sites.
+
+    If `instruction` is true, return those of the instruction level instead.
+    """
     if instruction:
         return [*_NODES]
     stages = [stage.value for stage in Stage]
@@ -314,7 +326,7 @@ def _check_seed(seed: int) -> None:
 
 
 def _bits_in_words(count: int, field: str) -> str:
-    """Describe a number of bits of a field, such as "a bit", "an exponent bit", "3 bits"."""
+    """Describe `count` bits of a field in words, such as "a bit", "an exponent bit", "3 bits"."""
     kind = "bit" if field == Field.ANY.value else f"{field} bit"
     if count > 1:
         return f"{count} {kind}s"
@@ -330,18 +342,18 @@ _NODES = {
 
 
 def _omitted(default: T) -> T:
-    """Return a field that records omit while it has its default."""
+    """Return a dataclass field that records omit if it has its default value."""
     return field(default=default, metadata={"omitted": True})
 
 
 def is_omitted(config: object, own: Member[Any]) -> bool:
-    """Return True if records omit this field of a configuration."""
+    """Return True if records omit the field `own` of `config`, because it has its default value."""
     return bool(own.metadata) and getattr(config, own.name) == own.default
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InstructionConfig:
-    """One instruction-level fault of a mission.
+    """The configuration of one instruction-level fault of a mission.
 
     Attributes:
         target: Injection site: a node, or a stage from which a node is drawn. In a user's
@@ -382,35 +394,35 @@ class InstructionConfig:
         _check_seed(self.seed)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values for a record."""
+        """Return the configuration as a dict for a record, without the fields that records omit."""
         unset = {name for name, own in self.__dataclass_fields__.items() if is_omitted(self, own)}
         return {name: value for name, value in asdict(self).items() if name not in unset}
 
     @property
     def place_seed(self) -> int:
-        """Seed with which node and invocation are drawn."""
+        """Seed for drawing the node and the invocation: `invocation_seed`, or else `seed`."""
         return self.seed if self.invocation_seed is None else self.invocation_seed
 
     @property
     def program(self) -> str:
-        """Program of a user's companion that is struck."""
+        """Name of the program of a user's companion that the fault strikes."""
         return self.target.partition("/")[0]
 
     @property
     def executable(self) -> str | None:
-        """Name of the struck process's executable; None for the program's own process."""
+        """Name of the struck process's executable, or None for the program's own process."""
         return self.target.partition("/")[2] or None
 
     def moment(self) -> FaultConfig:
-        """Return a fault in the program's process with the trigger that starts the counting."""
+        """Return a process fault, triggered at the moment from which instructions are counted."""
         return FaultConfig(target=f"{PROCESS}.{self.program}", seed=self.seed, at=self.at)
 
     def check_program(self, programs: Collection[str]) -> None:
-        """Validate the fault in a user's companion, given its programs.
+        """Check that the fault is possible in a user's companion with these `programs`.
 
         Raises:
             UnknownName: No program has this name.
-            FaultSpecError: This trigger is impossible for a process.
+            FaultSpecError: A process cannot have this trigger.
         """
         self.moment().check_program(programs)
 
@@ -425,11 +437,11 @@ class InstructionConfig:
         return f"{bits} in an instruction of {struck or self.target}{where}".replace("_", " ")
 
     def node(self) -> str:
-        """Return the target node, drawn from the target's nodes if the target is a stage.
+        """Return the target node. If the target is a stage, draw one of its nodes.
 
         Raises:
             UnknownName: The node or stage does not exist.
-            FaultSpecError: A setting needs a user's companion.
+            FaultSpecError: `at`, `objects` or `function` is set, which needs a user's companion.
         """
         for name in ("at", "objects", "function"):
             if not is_omitted(self, self.__dataclass_fields__[name]):
@@ -440,7 +452,7 @@ class InstructionConfig:
         return nodes[int(Stream.FAULT.generator(self.place_seed, "node").integers(len(nodes)))]
 
     def sampling_name(self) -> str:
-        """Return the name of the population of instructions, which every report states."""
+        """Return the sampling rule in words for reports, including the injector in `compat`."""
         if self.compat is not None:
             return f"{UNIFORM} with the operands and bits of {self.compat}"
         return self.sampling

@@ -1,4 +1,4 @@
-"""Configuration of a mission: a frozen record from which the flight can be repeated."""
+"""Configuration of a mission: a frozen dataclass from which the flight can be repeated."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ _NOT_WITH_LINK = "cannot be combined with --link"
 OF_THE_WORLD = (
     "world", "world_seed", "vehicle", "start", "camera_columns", "camera_rows",
 )  # fmt: skip
-"""Settings of the world and of the simulation in it."""
+"""Fields of `MissionConfig` that configure the world and its simulation."""
 
 OF_THE_COMPANION = (
     "planner", "platform", "stack", "a_max_mps2", "map_resolution_m", "map_range_m",
     "node_restart_s", "node_watchdog_s",
 )  # fmt: skip
-"""Settings of mavfi's own companion."""
+"""Fields of `MissionConfig` that configure mavfi's own companion."""
 
 _OF_LOST_NODES: Mapping[str, Any] = {"node_restart_s": 1.0, "node_watchdog_s": 5.0}
 NOT_OF_GOLDEN: Mapping[str, Any] = {
     "fault": None, "instruction": None, "detector": None, "isolate": (), **_OF_LOST_NODES,
 }  # fmt: skip
-"""Settings that a golden mission lacks or does not need, with their values in such a mission."""
+"""Fields that a golden mission does not use, with the values to which it resets them."""
 
 LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home; MAVBench plans between 1 and 10 m
 REMOTE_M = 1.0e7  # beyond this, float64 is coarser than a nanometre
@@ -73,7 +73,7 @@ LIMITS = {  # minimum and maximum of each number
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MissionConfig:
-    """One mission. Positions in the world frame (ENU), m.
+    """The configuration of one mission. Positions are in the world frame (ENU), in metres.
 
     Attributes:
         world: Name of a world, or path of a TOML file of boxes.
@@ -166,7 +166,7 @@ class MissionConfig:
                 )
         if self.fault is not None and self.instruction is not None:
             raise ConfigError(
-                "cannot be combined with a fault in a state: a mission takes one fault",
+                "cannot be combined with a state fault: a mission can have only one fault",
                 key="instruction",
             )
         if self.fault is not None:
@@ -185,7 +185,9 @@ class MissionConfig:
                 if getattr(self, name) not in (False, None, _LOSS_LIMIT_S):
                     raise ConfigError(_NEEDS_LINK, key=name)
         if self.origin is not None and not self.eyes:
-            raise ConfigError("needs --eyes, which starts a world", key="origin")
+            raise ConfigError(
+                "needs --eyes, which starts the world that the origin refers to", key="origin"
+            )
         if self.link is None:
             return
         if self.realtime:
@@ -219,7 +221,7 @@ class MissionConfig:
             return
         if not self.realtime and self.link is None:
             raise ConfigError(
-                f"{self.platform} needs --realtime, because measured times differ between flights",
+                f"{self.platform} needs --realtime, because it measures kernel times in flight",
                 key="platform",
             )
         if self.isolate or self.instruction is not None:
@@ -246,7 +248,11 @@ class MissionConfig:
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for the record of the run, without settings of the host."""
+        """Return the configuration as a dict for the record of the run.
+
+        Settings of the host, and settings that this kind of flight does not have, are omitted. For
+        a foreign autopilot without `eyes`, the settings of the world are None.
+        """
         values = asdict(self)
         del values["isolate"], values["key_file"]
         if self.instruction is not None:
@@ -263,15 +269,15 @@ class MissionConfig:
 
     @property
     def golden(self) -> MissionConfig:
-        """The same mission without fault and without protection."""
+        """The golden mission: the same mission without a fault and without a detector."""
         return replace(self, **NOT_OF_GOLDEN)
 
     @property
     def shared_flight(self) -> MissionConfig | None:
-        """The flight from which the mission can be forked: the mission without its fault.
+        """The fault-free mission from whose flight this mission can be forked, or None.
 
-        The settings for lost nodes have their defaults, because they do not matter without a fault.
-        The result is None if other processes or the wall clock affect the mission's flight.
+        It has the default settings for lost nodes, because they do not matter without a fault. It
+        is None if other processes or the wall clock affect this mission's flight.
         """
         alone = (
             self.isolate
@@ -291,7 +297,7 @@ class MissionConfig:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """User files whose contents the mission depends on."""
+        """Paths of the user's files on whose contents the mission depends."""
         model = None if self.detector is None else self.detector.model
         stack = self.stack.partition(":")[0]  # without the differences of a variant
         named = (self.world, self.platform, stack, self.vehicle)
@@ -308,10 +314,12 @@ class MissionConfig:
         return stack if own_m is None else replace(stack, goal_tolerance_m=own_m)
 
     def with_firmware(self) -> MissionConfig:
-        """Return the mission with the SITL binary of its real autopilot, for the record.
+        """Return the mission with `firmware` set to the SITL binary of its real autopilot.
+
+        A mission with mavfi's own autopilot is returned unchanged.
 
         Raises:
-            ConfigError: Neither the mission nor the environment names one.
+            ConfigError: Neither the mission nor the environment names the binary.
         """
         if self.autopilot == OWN_AUTOPILOT:
             return self
@@ -331,13 +339,13 @@ class MissionConfig:
         return tuple(name for name in (self.firmware, self.companion) if name is not None)
 
     def require_programs(self, *known: str | None) -> None:
-        """Reject a recorded mission that names an unknown program.
+        """Reject a recorded mission that would execute a program not listed in `known`.
 
         Flying a record executes the programs that it names, and a record is untrusted. Firmware
         named by the environment variable counts as known.
 
         Raises:
-            ConfigError: The mission names another program.
+            ConfigError: The mission names a program that is not known.
         """
         variable = FIRMWARE.get(self.autopilot, "")
         trusted = {os.path.realpath(name) for name in known if name}
@@ -354,7 +362,10 @@ class MissionConfig:
                 )
 
     def briefing(self, start_enu_m: FloatArray) -> Briefing:
-        """Build the briefing for a foreign autopilot at a position (3,) without a known world."""
+        """Build the briefing for a foreign autopilot in an unknown world.
+
+        `start_enu_m` (3,) is the position of the vehicle before take-off.
+        """
         goal = np.array(self.goal)
         low, high = np.minimum(goal, start_enu_m), np.maximum(goal, start_enu_m)
         bounds = np.concatenate([low - MARGIN_M, high + MARGIN_M])
@@ -381,8 +392,8 @@ class MissionConfig:
         if norm(goal - takeoff) <= tolerance_m:
             problem = f"is within {tolerance_m:g} m of the take-off point"
         elif not LOWEST_M <= float(goal[2]) <= HIGHEST_M:
-            problem = f"is {goal[2]:g} m high; flight levels are {LOWEST_M:g} to {HIGHEST_M:g} m"
+            problem = f"is {goal[2]:g} m high; it must be {LOWEST_M:g} to {HIGHEST_M:g} m high"
         elif norm(goal[:2] - start[:2]) > FARTHEST_M:
-            problem = f"is farther than {FARTHEST_M:g} m away"
+            problem = f"is farther than {FARTHEST_M:g} m from the start"
         if problem:
             raise ConfigError(f"the goal {problem}", key="goal")

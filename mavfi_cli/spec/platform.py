@@ -40,7 +40,7 @@ class _KernelLatency:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlatformProfile:
-    """A companion computer: latencies, cores, power and mass.
+    """A companion computer: the latency of each kernel, and its cores, power and mass.
 
     Raises:
         ValueError: A number is out of range, or a kernel is missing or unknown.
@@ -67,7 +67,7 @@ class PlatformProfile:
 
     @staticmethod
     def factor_of(name: str) -> float | None:
-        """Return the factor of a platform `measured:FACTOR`; None for any other.
+        """Return the factor of a platform named `measured:FACTOR`, or None for any other name.
 
         Raises:
             ConfigError: The factor is not a number or is out of range.
@@ -91,7 +91,7 @@ class PlatformProfile:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _KernelEntry:
-    """A kernel in a file: a latency, or a factor on the base's latency."""
+    """The entry for one kernel in a platform file: a latency, or a factor on the base's latency."""
 
     latency_s: float | None = None  # median latency of one invocation
     scale: float | None = None  # factor on the base's latency, instead of latency_s
@@ -100,7 +100,7 @@ class _KernelEntry:
 
     def __post_init__(self) -> None:
         if (self.latency_s is None) is (self.scale is None):
-            raise ValueError("must have either latency_s or scale")
+            raise ValueError("must have either latency_s or scale, but not both")
         _check_scale(self.scale)
         _check_latency(self.latency_s or 0.0, self.spread or 0.0)
 
@@ -202,7 +202,10 @@ def _measured(factor: float) -> PlatformProfile:
 def _kernels(
     file: _PlatformFile, base: PlatformProfile | None, path: Path
 ) -> dict[str, _KernelLatency]:
-    """Return each kernel's latency: from its entry, or else `scale` multiplied by the base's."""
+    """Return the latency of each kernel, keyed by the kernel's name.
+
+    A kernel that has no entry in the file has the base's latency, multiplied by the file's `scale`.
+    """
     based = {} if base is None else base.kernels
     scaled = _KernelEntry(scale=file.scale, source=file.sources.get("scale", ""))
     kernels = {}
@@ -211,7 +214,11 @@ def _kernels(
         source = entry.source or f"set in {path.name}"
         if entry.scale is not None:
             if base is None:
-                raise ConfigError("scale needs a base", path=path, key=f"kernels.{name}")
+                raise ConfigError(
+                    "scale needs a base, the platform whose latency it multiplies",
+                    path=path,
+                    key=f"kernels.{name}",
+                )
             latency_s = entry.scale * based[name].latency_s
             why = f": {entry.source}" if entry.source else ""
             source = f"{file.base} x {entry.scale:g}{why}"

@@ -42,7 +42,7 @@ _LIMITS = {  # minimum and maximum of each number
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stack:
-    """Structure, checks and gains of the companion. docs/reference/stacks.md lists the keys.
+    """The structure, checks and gains of mavfi's companion, as in docs/reference/stacks.md.
 
     Attributes:
         stretches_clock: A waypoint lasts until its distance is covered. If the speed limit clips a
@@ -135,14 +135,15 @@ class Stack:
             _require_node("standby", node)
             if node == "control":
                 raise ValueError(
-                    "standby: must not name control, which keeps its queue in its own process"
+                    "standby: must not name control, because a standby would not have its queue"
                 )
         if self.smoother not in SMOOTHERS:
             raise UnknownName("smoother", self.smoother, SMOOTHERS)
         if self.planner_radius_m < self.check_radius_m:
             raise ValueError(
-                f"planner_radius_m: must be at least check_radius_m, {self.check_radius_m:g}, or "
-                f"the check would reject every plan, got {self.planner_radius_m:g}"
+                f"planner_radius_m: must be at least check_radius_m ({self.check_radius_m:g}), or "
+                "the collision check would reject every plan; "
+                f"got {self.planner_radius_m:g}"
             )
         if self.acts_on_report_once and not (self.stops_on_report or self.plans_in_motion):
             raise ValueError(
@@ -164,21 +165,21 @@ class Stack:
                 _require_node("processes", node)
                 if node == "control":
                     raise ValueError(
-                        "processes: control works in every tick, so it must be alone in its process"
+                        "processes: control runs in every tick, so it must have its own process"
                     )
                 if node in seen:
                     raise ValueError(f"processes: must not name {node} twice")
                 seen.add(node)
 
     def settings_of(self, params: type) -> dict[str, Any]:
-        """Return the values of the keys that are also fields of a kernel's parameters."""
+        """Return the stack's value for each key that is also a field of the dataclass `params`."""
         return {key.name: getattr(self, key.name) for key in fields(params) if key.name in KEYS}
 
     @property
     def mark(self) -> StackMark:
-        """Return the identity of the stack, which a detector's model stores.
+        """The identity of the stack that a detector's model stores: its name, and a digest.
 
-        Keys with their default value are excluded, so a key added later changes no identity.
+        The digest excludes keys with their default value, so a key added later does not change it.
         """
         settings = self.settings_of(Stack)
         same = [key for key, value in _DEFAULTS.items() if settings[key] == value]
@@ -189,7 +190,7 @@ class Stack:
 
 
 def _quoted(pair: str) -> str:
-    """Return KEY=VALUE with quotes around a value that is a word, such as `smoother=release`."""
+    """Return KEY=VALUE with quotes around the value if it is a word, as in `smoother=ours`."""
     key, equals, value = pair.partition("=")
     word = value.strip().isidentifier() and value.strip() not in ("true", "false", "inf", "nan")
     return f'{key}{equals}"{value.strip()}"' if word else pair
@@ -209,10 +210,10 @@ _DEFAULTS = {
 
 
 def load_stack(text: str) -> Stack:
-    """Load a stack by `NAME`, `FILE.toml`, or either with `:KEY=VALUE,KEY=VALUE`.
+    """Load a stack from `NAME` or `FILE.toml`, or from either with `:KEY=VALUE,KEY=VALUE` appended.
 
-    NAME is a shipped stack. The values have TOML syntax, except that a word needs no quotes, and
-    replace those of the stack.
+    NAME is a shipped stack. The given values replace those of the stack. They have TOML syntax,
+    except that a word needs no quotes.
 
     Raises:
         UnknownName: No shipped stack has this name, and it is not a path to a TOML file.
@@ -237,7 +238,7 @@ def load_stack(text: str) -> Stack:
 
 
 def _values(path: Path) -> tuple[dict[str, Any], str]:
-    """Return the values of a file and its base, and the file's text."""
+    """Return the values in a stack file, completed with those of its base, and the file's text."""
     values, text = read_toml(path)
     own = {} if path.parent == STACKS.folder else dict.fromkeys(KEYS, f"set in {path.name}")
     about = {"name": path.stem, "description": ""}

@@ -1,4 +1,4 @@
-"""Statistics: pure functions of numbers, without flights, files or ledgers.
+"""Statistics as pure functions of numbers, without access to flights, files or ledgers.
 
 shares      proportions and their intervals, also for sampled clusters; sample sizes; the
             probability that an SDC in a kernel makes the mission fail

@@ -44,26 +44,27 @@ def interval(
     seed: int = 1,
     weights: FloatArray | None = None,
 ) -> Interval:
-    """Return a statistic with its bootstrap interval, or a mean of many values with a normal one.
+    """Return a statistic of a sample with its bootstrap confidence interval.
 
     The interval is BCa (bias-corrected and accelerated; B. Efron, JASA 82, 1987). It is the
     percentile interval if BCa is not defined, as for the median of tied values, or if there are
     more values than resamples, because BCa leaves out each value in turn. The mean of LARGE or more
-    values has the normal interval.
+    equally weighted values has a normal interval instead. The result is NaN without values. The
+    ends of the interval are NaN for a single value.
 
     Args:
         values: (n,) one value per mission; for paired differences, one difference per mission.
         statistic: reduces the last axis of an array.
-        weights: (n,) weights of a stratified sample, for the mean only; None for equal ones.
+        weights: (n,) weights of a stratified sample, for the mean only; None for equal weights.
 
     Raises:
-        ValueError: the weights differ, and the statistic is not the mean.
+        ValueError: the weights are unequal, and the statistic is not the mean.
     """
     sample = np.asarray(values, dtype=np.float64)
     count = len(sample)
     if weights is not None and len(set(weights.tolist())) > 1:
         if statistic is not mean:
-            raise ValueError("weights that differ need the mean as the statistic")
+            raise ValueError("unequal weights can be used with the mean only")
         rows = partial(_weighted_mean, sample, weights)
         return interval_of_rows(count, rows, resamples=resamples, confidence=confidence, seed=seed)
     if count == 0:
@@ -83,7 +84,7 @@ def interval(
 def _resampled(
     sample: FloatArray, statistic: Statistic, confidence: float, resamples: int, seed: int
 ) -> tuple[float, float]:
-    """Return the ends of the bootstrap interval."""
+    """Return the ends of the BCa interval, or of the percentile interval if BCa is unsuitable."""
     from scipy.stats import DegenerateDataWarning, bootstrap
 
     result, ends = None, (math.nan, math.nan)
@@ -114,10 +115,12 @@ def interval_of_rows(
     confidence: float = 0.95,
     seed: int = 1,
 ) -> Interval:
-    """Return a statistic over several columns with its interval, found by resampling whole rows.
+    """Return a statistic of a table with its bootstrap interval, resampling whole rows.
 
     Args:
-        statistic: takes row indices (..., n) and reduces the last axis.
+        count: number of rows, n.
+        statistic: maps row indices of shape (..., n) to the statistic of these rows, of shape
+            (...); it has access to the columns itself.
     """
     return interval(
         np.arange(count, dtype=np.float64),

@@ -31,12 +31,12 @@ _DIGITS = 9  # decimals to which relative sums are compared; equal ones may diff
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class McNemar:
-    """Counts of pairs by success, and the p-value of the difference.
+    """McNemar's test of two treatments: counts of pairs by which treatment succeeded, and p-value.
 
     Attributes:
-        both, neither: pairs in which both or neither succeeded.
-        only_first, only_second: pairs in which only one succeeded.
-        p_value: two-sided; see `of`.
+        both, neither: number of pairs in which both treatments succeeded, or neither.
+        only_first, only_second: number of pairs in which only that treatment succeeded.
+        p_value: two-sided p-value of equal success rates; see `of`.
     """
 
     both: int
@@ -53,15 +53,16 @@ class McNemar:
         weights: FloatArray | None = None,
         clusters: NDArray[np.int64] | None = None,
     ) -> McNemar:
-        """Run McNemar's exact test (Psychometrika 12, 1947) on the pairs that differ.
+        """Run McNemar's exact test on the same missions under two treatments.
 
-        Without an effect, these are fair coin tosses. With weights, the p-value is that of
-        `sign_flips` for the weighted differences. With clusters, it is that of `sign_flips` for the
-        sums of the differences in each cluster.
+        If the treatments are equally good, each pair with different outcomes is a fair coin toss
+        (Psychometrika 12, 1947). With weights, the p-value is that of `sign_flips` for the weighted
+        differences. With clusters, it is that of `sign_flips` for the sums of the differences in
+        each cluster.
 
         Args:
             first, second: success of each mission under each treatment, (n,).
-            weights: (n,) weights of a stratified sample; None for equal ones.
+            weights: (n,) weights of a stratified sample; None for equal weights.
             clusters: (n,) the cluster of each mission; None for independent missions.
         """
         from scipy.stats import binomtest
@@ -102,7 +103,7 @@ class McNemar:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeightedMcNemar(McNemar):
-    """Counts of pairs in a stratified sample, with their weighted difference."""
+    """McNemar's test of a stratified sample, with the weighted difference of success rates."""
 
     difference: float = field()
 
@@ -110,13 +111,13 @@ class WeightedMcNemar(McNemar):
 def sign_flips(differences: Sequence[float]) -> float:
     """Return the two-sided p-value of Fisher's randomisation test of paired differences.
 
-    Without an effect, both signs of a difference are equally likely. The test assumes no
+    Without an effect, a difference is equally likely to have either sign. The test assumes no
     distribution, so it stays valid if most differences are zero, where bootstrap intervals are too
     narrow (R. A. Fisher, The Design of Experiments, 1935, section 21). It tries all sign patterns
     if there are at most _PATTERNS; otherwise it tries _PATTERNS random ones from a fixed seed.
 
     Args:
-        differences: one for each independent pair; zeros have no effect.
+        differences: one for each independent pair; zeros do not change the result.
 
     Returns:
         The p-value; 1 if at most one difference is not zero.
@@ -137,9 +138,10 @@ def sign_flips(differences: Sequence[float]) -> float:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Return p-values corrected for a family of tests (S. Holm, Scand. J. Statistics 6, 1979).
+    """Return the p-values of a family of tests, corrected by Holm's method.
 
-    The values keep their order. Reject a hypothesis if its corrected value is below the level.
+    The method is that of S. Holm, Scand. J. Statistics 6, 1979. The values keep their order. Reject
+    a hypothesis if its corrected value is below the level.
     """
     count = len(p_values)
     corrected = [0.0] * count
@@ -152,11 +154,14 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorstCase:
-    """Worst values of successful flights, compared with golden flights; NaN without flights.
+    """The worst-case flight time or energy with faults, and the part that protection recovers.
+
+    Only successful flights count. All attributes are NaN without golden or faulty flights.
 
     Attributes:
-        golden: the reference, the mean of the golden flights.
-        golden_worst, faulty_worst, protected_worst: the largest values.
+        golden: the reference, which is the mean of the golden flights.
+        golden_worst, faulty_worst, protected_worst: the largest value without faults, with faults,
+            and with faults and protection.
         increase: faulty worst case divided by the reference, minus 1; 0.738 for Factory.
         recovered: reduction by protection, divided by the reference; 0.642 for Factory.
         recovered_share: `recovered` / `increase`, 0.87 for Factory; NaN unless the faulty worst
@@ -175,11 +180,12 @@ class WorstCase:
     def of(
         cls, golden: Sequence[float], faulty: Sequence[float], protected: Sequence[float] = ()
     ) -> WorstCase:
-        """Compare the flight times, or energies, of the successful missions of each setting.
+        """Compare the worst flight times or energies of three settings.
 
         Args:
-            golden: OWN if the other values are already divided by those of their missions' golden
-                flights.
+            golden, faulty, protected: values of the successful missions without faults, with
+                faults, and with faults and protection. `golden` is OWN if the other values are
+                already divided by those of their missions' golden flights.
         """
         known = bool(golden and faulty)
         reference = math.fsum(golden) / len(golden) if known else math.nan
@@ -211,7 +217,7 @@ def paired_difference(
     second: Sequence[bool] | BoolArray,
     clusters: Sequence[Hashable],
 ) -> Interval:
-    """Return the second treatment's rate minus the first's, on the same missions.
+    """Return the hit rate of the second treatment minus that of the first, on the same missions.
 
     The interval is that of D. G. Bonett and R. M. Price (J. Educational and Behavioral Statistics
     37, 2012): one pair is added to each of the two kinds of differing pairs, so the interval has a
@@ -243,13 +249,14 @@ def paired_difference(
 def net_share(
     before: BoolArray, after: BoolArray, clusters: Sequence[Hashable], *, seed: int = 1
 ) -> Interval:
-    """Return the hits that a treatment undoes minus those it causes, as a share of the hits before.
+    """Return the net reduction in hits by a treatment, as a share of the hits without it.
 
     It is (hits before - hits after) / hits before on the same missions. It is below 0 if the
-    treatment causes more than it undoes. The ends of the interval are percentiles of random draws.
-    Each draw takes three shares from their posterior distributions under Jeffreys' prior: missions
-    that are hits before, hits that are undone, and other missions that become hits. The numbers of
-    missions are divided by the design effect of the clusters.
+    treatment causes more hits than it undoes, and NaN if there are no hits before. The ends of the
+    interval are percentiles of random draws. Each draw takes three shares from their posterior
+    distributions under Jeffreys' prior: missions that are hits before, hits that are undone, and
+    other missions that become hits. The numbers of missions are divided by the design effect of the
+    clusters.
 
     Args:
         before, after: whether each mission is a hit without and with the treatment, (n,).
@@ -275,7 +282,10 @@ def net_share(
 
 
 def _cluster_effect(values: NDArray[np.int64], clusters: Sequence[Hashable]) -> float:
-    """Return the ratio of a mean's variance to that for independent values; at least 1."""
+    """Return the design effect of clusters on the mean of `values`, at least 1.
+
+    It is the variance of the mean, divided by its variance if the values were independent.
+    """
     residuals = values - values.mean()
     squares = float((residuals**2).sum())
     sums: dict[Hashable, float] = {}
@@ -290,15 +300,17 @@ def _cluster_effect(values: NDArray[np.int64], clusters: Sequence[Hashable]) -> 
 def recovered_share(
     golden: Count, faulty: Count, protected: Count, *, draws: int = DRAWS, seed: int = 1
 ) -> Interval:
-    """Return the share of the lost success that protection recovers, from three independent rates.
+    """Return the share of a loss in success rate that protection recovers.
 
-    It is a ratio of two differences. The three rates are drawn from their posterior distributions
-    under Jeffreys' prior, Beta(wins + 1/2, losses + 1/2), so that even a rate of 100 out of 100
-    varies. The ends of the interval are percentiles of the ratio, including draws in which the
-    faults cost nothing.
+    It is (protected - faulty) / (golden - faulty), a ratio of two differences of independent
+    success rates. The value is NaN if the faults cost nothing. The three rates are drawn from their
+    posterior distributions under Jeffreys' prior, Beta(wins + 1/2, losses + 1/2), so that even a
+    rate of 100 out of 100 varies. The ends of the interval are percentiles of the ratio, including
+    draws in which the faults cost nothing.
 
     Args:
-        golden, faulty, protected: successes and missions of each.
+        golden, faulty, protected: number of successes and number of missions without faults, with
+            faults, and with faults and protection.
     """
     rng = np.random.default_rng(seed)
     drawn = [

@@ -24,9 +24,11 @@ _NEAR = 1e-9  # search offset from the area itself, because areas of 0 and 1 hav
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Curves:
-    """Curves, (m,) each, over thresholds in units of the detector's own threshold.
+    """The ROC and precision-recall curves of a detector over all thresholds, and their areas.
 
-    If there are no flights of one kind, the curves are empty and the numbers are NaN.
+    Each curve has shape (m,), with one point per threshold. Thresholds are in units of the
+    detector's own threshold. If there are no flights of one kind, harmful or error-free, the curves
+    are empty and the numbers are NaN.
 
     Attributes:
         positives, negatives: number of harmful faults and of error-free flights with a score.
@@ -35,8 +37,8 @@ class Curves:
         recall: share of harmful faults with an alarm.
         precision: share of harmful faults among flights with an alarm; 1 at the first threshold.
         area, area_low, area_high: area under the ROC curve, and the ends of its 95 % interval.
-        average_precision: area under the precision-recall curve. It depends on the mix of flights;
-            a detector that guesses has positives / (positives + negatives).
+        average_precision: area under the precision-recall curve. It depends on the mix of flights:
+            for a detector that guesses, it is positives / (positives + negatives).
         operating_point: false positive rate and recall at the detector's own threshold.
     """
 
@@ -54,10 +56,11 @@ class Curves:
 
     @classmethod
     def of(cls, harmful: Sequence[float], error_free: Sequence[float], **more: Any) -> Self:
-        """Compute the curves from scores in units of the threshold.
+        """Compute the curves from the scores of harmful faults and of error-free flights.
 
         Args:
-            more: fields of a subclass.
+            harmful, error_free: one score per flight, in units of the detector's own threshold.
+            more: additional fields of a subclass.
         """
         from scipy.stats import rankdata
 
@@ -93,7 +96,10 @@ class Curves:
 
 
 def _area_interval(area: float, positives: int, negatives: int) -> tuple[float, float]:
-    """Return the ends of the 95 % interval: areas whose own half width just reaches `area`."""
+    """Return the ends of the 95 % confidence interval of an area under the ROC curve.
+
+    An end is the area whose own interval just reaches `area`.
+    """
     from scipy.optimize import brentq
 
     z = z_of(0.95)

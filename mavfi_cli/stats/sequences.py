@@ -22,7 +22,7 @@ _LEVEL = 0.05  # level for which it is narrowest there
 
 
 def anytime_p(z: float, count: int) -> float:
-    """Return the anytime-valid p-value of an estimate from `count` values.
+    """Return the anytime-valid p-value of an estimate from `count` observations.
 
     The estimate lies z standard errors from the tested value.
     """
@@ -32,13 +32,16 @@ def anytime_p(z: float, count: int) -> float:
 
 
 def anytime_z(count: float, level: float = _LEVEL) -> float:
-    """Return the number of standard errors beyond which `anytime_p` is below a level."""
+    """Return the distance from the tested value, in standard errors, that gives a p-value `level`.
+
+    The p-value is that of `anytime_p`. Estimates farther away have a smaller one.
+    """
     u = _u(count)
     return math.sqrt(2.0 * (1.0 + 1.0 / u) * math.log(math.sqrt(u + 1.0) / level))
 
 
 def anytime_interval(effect: Interval) -> Interval:
-    """Widen an effect's 95 % interval for a single look until it is valid at all looks at once."""
+    """Widen an effect's 95 % interval, which is valid at one look, to be valid at all looks."""
     if not effect.count:
         return effect
     wider = anytime_z(effect.count) / z_of(1.0 - _LEVEL)
@@ -50,21 +53,21 @@ def anytime_interval(effect: Interval) -> Interval:
 
 
 def anytime_count(z: float, count: int, level: float) -> float:
-    """Return the count at which `anytime_p` falls below a level, if the effect stays the same.
+    """Predict how many observations bring `anytime_p` down to `level` if the effect stays the same.
 
     Args:
         z, count: current distance from the tested value, in standard errors, and current number of
             observations.
 
     Returns:
-        The count; infinite if z or `count` is 0.
+        The predicted number, at least `count`; infinite if z or `count` is 0.
     """
     if not z or not count:
         return math.inf
     from scipy.optimize import brentq
 
     def short(number: float) -> float:
-        """Return how many standard errors the effect still lacks at this number of observations."""
+        """Return by how many standard errors the effect falls short of `level` at this number."""
         return anytime_z(number, level) - z * math.sqrt(number / count)
 
     enough = float(count)
@@ -74,7 +77,7 @@ def anytime_count(z: float, count: int, level: float) -> float:
 
 
 def _u(count: float) -> float:
-    """Return n rho^2 for the rho whose interval is narrowest at TUNED observations."""
+    """Return u = n rho^2 for n = `count`, with the rho that tunes intervals to TUNED values."""
     from scipy.special import lambertw
 
     narrowest = -float(lambertw(-(_LEVEL**2) / math.e, -1).real) - 1.0

@@ -1,10 +1,10 @@
-"""Proportions of independent runs and of clusters, with intervals; sample sizes; cross-layer rates.
+"""Proportions with confidence intervals, sample sizes, and the effect of SDCs on missions.
 
-In a clustered sample, each run strikes one cluster: a sampled window of executed instructions.
-Clusters are drawn uniformly from a stratum, such as the windows that begin at one function. The
-formulas are those of W. G. Cochran, Sampling Techniques, 3rd edition, 1977. The spread of a few
-clusters is a poor estimate, so the quantiles are Student's, with the degrees of freedom of F. E.
-Satterthwaite (Biometrics Bulletin 2, 1946).
+Runs are independent or come in clusters. In a clustered sample, each run strikes one cluster: a
+sampled window of executed instructions. Clusters are drawn uniformly from a stratum, such as the
+windows that begin at one function. The formulas are those of W. G. Cochran, Sampling Techniques,
+3rd edition, 1977. The spread of a few clusters is a poor estimate, so the quantiles are Student's,
+with the degrees of freedom of F. E. Satterthwaite (Biometrics Bulletin 2, 1946).
 """
 
 from __future__ import annotations
@@ -25,7 +25,10 @@ _LEAST = 1e-6  # smaller margins and differences need more missions than anyone 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Interval:
-    """A statistic with the ends of its interval; NaN if there are too few values."""
+    """The value of a statistic, the ends of its confidence interval, and the sample size.
+
+    The value or the ends are NaN if the sample is too small.
+    """
 
     value: float
     low: float
@@ -33,7 +36,11 @@ class Interval:
     count: int
 
     def minus(self, other: Interval) -> Interval:
-        """Subtract an independent effect; the distances to the ends add in quadrature (MOVER)."""
+        """Return this statistic minus an independent one, with the interval of the difference.
+
+        The distances between the values and the ends of their intervals add in quadrature (MOVER).
+        The sample size is the smaller one of the two.
+        """
         value = self.value - other.value
         below = math.hypot(self.value - self.low, other.high - other.value)
         above = math.hypot(self.high - self.value, other.value - other.low)
@@ -42,9 +49,10 @@ class Interval:
 
     @staticmethod
     def welch(first: FloatArray, second: FloatArray, confidence: float = 0.95) -> Interval:
-        """Return the second mean minus the first (B. L. Welch, Biometrika 34, 1947).
+        """Return the mean of `second` minus that of `first`, with Welch's confidence interval.
 
-        The result is NaN if a sample is empty. Its ends are NaN if a sample has a single value.
+        It does not assume equal variances (B. L. Welch, Biometrika 34, 1947). The result is NaN if
+        a sample is empty. Its ends are NaN if a sample has a single value.
 
         Args:
             first, second: (n,) and (m,) independent values.
@@ -69,7 +77,7 @@ NO_INTERVAL = Interval(value=math.nan, low=math.nan, high=math.nan, count=0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Share:
-    """A proportion with its interval."""
+    """A proportion with its counts, and the ends of its confidence interval."""
 
     count: int
     total: int
@@ -84,16 +92,16 @@ class Share:
 
     @property
     def counts(self) -> str:
-        """Count and total, such as `3 of 98`."""
+        """Count and total as text, such as `3 of 98`."""
         return f"{self.count:,} of {self.total:,}"
 
     @property
     def effect(self) -> Interval:
-        """The proportion as an effect."""
+        """The proportion as an `Interval` whose sample size is `total`."""
         return Interval(value=self.share, low=self.low, high=self.high, count=self.total)
 
     def minus(self, other: Share) -> Interval:
-        """Return the difference of two independent rates, with the hybrid score interval.
+        """Return this rate minus an independent one, with the hybrid score interval.
 
         This is method 10 of R. G. Newcombe, Statistics in Medicine 17, 1998, which adds the
         distances to the ends of the two Wilson intervals in quadrature. The result is NaN if a rate
@@ -105,9 +113,10 @@ class Share:
         return replace(difference, low=max(-1.0, difference.low), high=min(1.0, difference.high))
 
     def fisher(self, other: Share) -> float:
-        """Return the two-sided p-value of Fisher's exact test of two rates; 1 if one is NaN.
+        """Return the two-sided p-value of Fisher's exact test of whether two rates are equal.
 
-        A stratified sample counts as its effective number of observations.
+        It is 1 if a rate has no observations. A stratified sample counts as its effective number of
+        observations.
         """
         from scipy.stats import fisher_exact
 
@@ -118,13 +127,16 @@ class Share:
         return float(fisher_exact([hits, misses]).pvalue)
 
     def per_hour(self, upsets_per_hour: float) -> tuple[float, float, float]:
-        """Return the failed missions per flight hour for this share of failures: value, low, high.
+        """Return how many missions fail per flight hour if this share of all upsets fail theirs.
 
         The extrapolation assumes at most one upset per mission, and that an upset does as much harm
         as a fault of the campaign.
 
         Args:
             upsets_per_hour: bit flips that reach the attacked kernels per flight hour.
+
+        Returns:
+            Failed missions per flight hour, and the low and high end of the interval.
 
         Raises:
             ConfigError: the rate is negative.
@@ -136,7 +148,7 @@ class Share:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StratifiedShare(Share):
-    """A proportion estimated from a stratified sample with weights."""
+    """A proportion estimated from a weighted, stratified sample, with its effective sample size."""
 
     effective: int = field()
 
@@ -144,10 +156,11 @@ class StratifiedShare(Share):
 def wilson(
     count: int, total: int, *, design_effect: float = 1.0, confidence: float = 0.95
 ) -> Share:
-    """Return the Wilson score interval (E. B. Wilson, JASA 22, 1927).
+    """Return the proportion `count` / `total` with its Wilson score interval.
 
-    Without observations, the interval is [0, 1] and the share is NaN. The number of observations is
-    divided by the design effect; SciPy's `proportion_ci` does not support this.
+    The interval is that of E. B. Wilson, JASA 22, 1927. Without observations, it is [0, 1] and the
+    share is NaN. The number of observations is divided by the design effect; SciPy's
+    `proportion_ci` does not support this.
     """
     if total == 0:
         return Share(count=0, total=0, share=math.nan, low=0.0, high=1.0)
@@ -156,7 +169,11 @@ def wilson(
 
 
 def score_interval(share: float, number: float, confidence: float) -> tuple[float, float]:
-    """Return the ends of Wilson's interval for a share of `number` (above 0) observations."""
+    """Return the ends of the Wilson interval of a proportion `share`.
+
+    Args:
+        number: number of observations, above 0; need not be an integer.
+    """
     z = z_of(confidence)
     z2 = z**2
     centre = (share + z2 / (2 * number)) / (1 + z2 / number)
@@ -167,16 +184,16 @@ def score_interval(share: float, number: float, confidence: float) -> tuple[floa
 
 
 def unseen_share(total: int, confidence: float = 0.95) -> float:
-    """Return the largest share that is compatible with no hit in `total` independent runs.
+    """Return the upper confidence bound on the probability of an event that was never observed.
 
-    It is the one-sided bound of C. J. Clopper and E. S. Pearson, Biometrika 26, 1934. Without runs
-    it is 1.
+    The event occurred in none of `total` independent runs. The bound is the one-sided one of C. J.
+    Clopper and E. S. Pearson, Biometrika 26, 1934. It is 1 without runs.
     """
     return 1.0 - (1.0 - confidence) ** (1.0 / total) if total else 1.0  # exact; SciPy iterates
 
 
 def z_of(confidence: float) -> float:
-    """Return the two-sided normal quantile for a confidence between 0 and 1.
+    """Return the two-sided standard normal quantile for a confidence level: 1.96 for 0.95.
 
     Raises:
         ConfigError: the confidence is not between 0 and 1.
@@ -189,11 +206,17 @@ def z_of(confidence: float) -> float:
 
 
 def mixture(parts: Sequence[tuple[int, Share]]) -> dict[str, float]:
-    """Return `share`, `low` and `high` of a whole from its parts, weighted by their true sizes.
+    """Estimate a population's proportion from those of its parts, weighted by their true sizes.
 
     The interval adds the distances to the ends of the parts' Wilson intervals in quadrature (MOVER,
     G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). If the whole is empty, or a part that
     is not empty was never sampled, the share is NaN and the interval is [0, 1].
+
+    Args:
+        parts: true size of each part, and the proportion in its sample.
+
+    Returns:
+        The proportion and the ends of its interval, as `share`, `low` and `high`.
     """
     whole = sum(size for size, _ in parts)
     if not whole:
@@ -206,7 +229,7 @@ def mixture(parts: Sequence[tuple[int, Share]]) -> dict[str, float]:
 
 
 def missions_for_margin(margin: float, *, expected: float = 0.5, confidence: float = 0.95) -> int:
-    """Return the fewest missions whose Wilson interval has a half width of at most `margin`.
+    """Return the fewest missions for which a Wilson interval has a half width of at most `margin`.
 
     The condition (z / (1 + z²/n)) sqrt(p (1 - p)/n + z²/(4 n²)) <= m is, with u = z²/n, the
     quadratic u² (1/4 - m²) + u (p (1 - p) - 2 m²) - m² <= 0.
@@ -236,8 +259,8 @@ def pairs_for_difference(
 ) -> int:
     """Return how many pairs McNemar's test needs to detect a difference of success rates.
 
-    It is (z_a sqrt(q) + z_b sqrt(q - d²))² / d², where q is the share of pairs whose outcomes
-    differ and d is the difference (R. J. Connor, Biometrics 43, 1987).
+    It is (z_a sqrt(q) + z_b sqrt(q - d²))² / d², where q = `discordant` is the share of pairs whose
+    outcomes differ, and d is the difference (R. J. Connor, Biometrics 43, 1987).
 
     Raises:
         ConfigError: the difference is below a millionth or exceeds the share of differing pairs,
@@ -247,7 +270,7 @@ def pairs_for_difference(
 
     if not _LEAST <= abs(difference) <= discordant <= 1.0:
         raise ConfigError(
-            f"must be at least {_LEAST:g}, and at most the share of pairs that differ "
+            f"must be at least {_LEAST:g}, and at most the share of pairs with different outcomes "
             f"(--discordant {discordant:g}), got {difference:g}",
             key="difference",
         )
@@ -260,7 +283,7 @@ def pairs_for_difference(
 
 @dataclass(frozen=True, slots=True)
 class CrossLayer:
-    """Failures of a kernel and of the missions that use it.
+    """How often faults corrupt the output of an isolated kernel, and how often they fail missions.
 
     Attributes:
         corruption: share of faults in the isolated kernel that silently corrupt its output.
@@ -309,10 +332,12 @@ Sampled = Mapping[Any, int]
 def clustered_share(
     hits: Sequence[bool], clusters: Sequence[Cluster | None], sampled: Sampled
 ) -> Share:
-    """Return the share of hits among clustered runs, with its 95 % interval.
+    """Return the share of hits among runs that come in clusters, with its 95 % interval.
 
     Args:
+        hits: whether each run is a hit.
         clusters: stratum and cluster of each run; None for a run that is its own cluster.
+        sampled: number of sampled clusters of each stratum, including those without a run.
     """
     alone, spread = _spread(hits, clusters, sampled)
     freedom = [len(hits), *(number - 1 for number, _ in spread)]
@@ -325,7 +350,10 @@ def clustered_share(
 def design_effect(
     hits: Sequence[bool], clusters: Sequence[Cluster | None], sampled: Sampled | None = None
 ) -> float:
-    """Return the ratio of a share's variance to that for independent runs; at least 1."""
+    """Return the design effect of clusters on the share of hits, at least 1.
+
+    It is the variance of the share, divided by its variance if all runs were independent.
+    """
     share = sum(hits) / len(hits) if hits else 0.0
     if not 0.0 < share < 1.0:
         return 1.0
@@ -337,13 +365,14 @@ def design_effect(
 def _spread(
     hits: Sequence[bool], clusters: Sequence[Cluster | None], sampled: Sampled
 ) -> tuple[float, list[tuple[int, float]]]:
-    """Return the variance of the hit count: of all lone runs, and of each stratum.
+    """Return the variance of the number of hits, split into independent contributions.
 
-    The variance of a stratum follows its number of clusters. The share is a ratio of two estimated
-    totals (Cochran, sections 6.4 and 9A), so the residuals from the overall share are summed in
-    each cluster. The spread of these sums shows how far the share would move if other clusters were
-    drawn. It accounts for the similarity of a cluster's runs, the unequal sizes of clusters, and
-    the error of the estimated weights of strata.
+    The first value is the contribution of all runs without a cluster. Each entry of the list holds
+    the number of clusters of a stratum, and the contribution of that stratum. The share is a ratio
+    of two estimated totals (Cochran, sections 6.4 and 9A), so the residuals from the overall share
+    are summed in each cluster. The spread of these sums shows how far the share would move if other
+    clusters were drawn. It accounts for the similarity of a cluster's runs, the unequal sizes of
+    clusters, and the error of the estimated weights of strata.
     """
     share = sum(hits) / len(hits) if hits else 0.0
     strata: dict[Hashable, dict[Hashable, float]] = {}
@@ -364,7 +393,9 @@ def _spread(
 
 
 def estimated_total(strata: Sequence[tuple[Sequence[float], int]]) -> Interval:
-    """Estimate the total over strata, from members drawn uniformly from each stratum.
+    """Estimate the sum of a value over all members of all strata, from a sample of each stratum.
+
+    The members in a sample are drawn uniformly from their stratum.
 
     The interval has the correction for a finite population (Cochran, section 5.4). It is symmetric
     on a logarithmic scale, because window lengths are skewed. Its lower end is never below the
@@ -392,7 +423,11 @@ def estimated_total(strata: Sequence[tuple[Sequence[float], int]]) -> Interval:
 
 
 def _student(variances: Sequence[float], freedom: Sequence[int]) -> float:
-    """Return the 97.5 % quantile of Student's t for a sum of variances (Satterthwaite)."""
+    """Return the 97.5 % quantile of Student's t, with Satterthwaite's degrees of freedom.
+
+    Args:
+        variances, freedom: the independent variances that are summed, and their degrees of freedom.
+    """
     from scipy.special import stdtrit
 
     doubt = sum(own**2 / n for own, n in zip(variances, freedom, strict=True))

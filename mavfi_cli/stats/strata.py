@@ -1,4 +1,4 @@
-"""Stratified samples: the number of missions for each stratum, and weighted rates.
+"""Stratified samples: how missions are allocated to strata, and rates from weighted missions.
 
 A stratum is a part of the population, such as the flips of exponent bits. The weight of a mission
 is the number of uniformly drawn missions that it stands for, so that the weights of a sample add up
@@ -38,12 +38,12 @@ def spread(hits: int, missions: int) -> float:
 
 
 def allocate(sizes: Sequence[float], spreads: Sequence[float], missions: int) -> list[int]:
-    """Return the number of missions for each stratum, at least 1.
+    """Return how many missions to fly in each stratum, at least one in each.
 
-    Each stratum gets one mission. Most of the others are allocated in proportion to size times
-    spread (J. Neyman, J. Royal Statistical Society 97, 1934). A share DEFENCE of them is allocated
-    in proportion to size alone, so that a stratum whose spread was underestimated still gets
-    missions (T. Hesterberg, Technometrics 37, 1995).
+    Each stratum gets one mission. Most of the other missions are allocated in proportion to size
+    times spread (J. Neyman, J. Royal Statistical Society 97, 1934). A share DEFENCE of them is
+    allocated in proportion to size alone, so that a stratum whose spread was underestimated still
+    gets missions (T. Hesterberg, Technometrics 37, 1995).
 
     Args:
         sizes: shares of the strata in the population; they add up to 1.
@@ -93,7 +93,11 @@ def rounded(table: Sequence[Sequence[float]], rng: np.random.Generator) -> list[
 
 
 def _cycle(cells: Sequence[Sequence[int]], row: int) -> list[tuple[int, int]]:
-    """Return a cycle of non-integer cells along rows and columns in turn, two cells in each."""
+    """Return the row and column indices of a cycle of non-integer cells.
+
+    The cycle moves along rows and columns alternately. Every row or column that it visits contains
+    two of its cells. The search starts in `row`, which must have a cell that is not an integer.
+    """
     lines, path = [(0, row)], list[tuple[int, int]]()  # a line is a row (0) or a column (1)
     while True:
         axis, index = lines[-1]
@@ -122,7 +126,7 @@ def weighted_share(
 
     The interval adds the distances to the ends of the strata's Wilson intervals in quadrature
     (MOVER; G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008), so that a stratum without
-    hits still has a width. The sample size of a stratum is its effective number, `kish`. The
+    hits still has a width. The sample size of a stratum is the effective one, given by `kish`. The
     fraction of a stratum that is counted is also an estimate. Its error, times the difference
     between the stratum's share of hits and the overall share, is added in quadrature too.
 
@@ -131,7 +135,8 @@ def weighted_share(
             the strata are None, and the interval is Wilson's.
 
     Returns:
-        The share, with the unweighted numbers of missions and hits, and the effective number.
+        The share with its interval, the unweighted numbers of missions and hits, and the effective
+        sample size.
     """
     number = sum(hit and kept for hit, kept in zip(hits, counted, strict=True))
     plain = wilson(number, sum(counted), confidence=confidence)

@@ -23,9 +23,10 @@ def fly(
     options: Options,
     spectator: Spectator,
 ) -> pa.Table:
-    """Fly those `missions` that the folder does not have yet; return the table of all `missions`.
+    """Fly those `missions` that have no result in `folder` yet, and return a table of all of them.
 
-    Other missions on the folder's list, left by a larger plan that was interrupted, are not flown.
+    The folder's list may contain other missions, left by a larger plan that was interrupted. These
+    are not flown.
 
     Raises:
         CampaignStopped, RecordError, Interrupted: as `run_campaign`.

@@ -1,7 +1,7 @@
 """`mavfi compare`: the same missions on several platforms, as in the preset fig16.
 
-The folder holds a campaign. Its subfolder `timeline` holds another one, with the complete records
-of one golden flight per platform.
+The output folder holds a campaign. Its subfolder `timeline` holds another campaign, with the
+complete records of one golden flight per platform.
 """
 
 from __future__ import annotations
@@ -44,14 +44,16 @@ SCHEMA = 2  # of compare.json
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparePlan:
-    """Plan of a comparison. The defaults equal the preset fig16 in many worlds (Fig. 16).
+    """The plan of a comparison of platforms: which missions each platform flies.
+
+    The defaults are those of the preset `fig16` with a different world for each seed (Fig. 16).
 
     Attributes:
-        platforms: names or files; the first one is the reference for the others.
+        platforms: names or files; the others are compared with the first one.
         inject: stages, states or groups to corrupt, one per flight; if empty, only
             golden flights are flown.
-        detectors: names; `none` is always flown, named or not.
-        missions: number per platform, setting and target of `inject`.
+        detectors: names; `none` is always flown, even if it is not named.
+        missions: number of missions per platform, setting and target of `inject`.
         seed: root of the faults' seeds.
         field: bit field to strike; if None, any bit may be drawn.
     """
@@ -83,18 +85,21 @@ class ComparePlan:
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """The settings of each platform: golden and, with faults, `none` and the detectors."""
+        """The names of the settings that each platform flies.
+
+        They are `golden` and, if faults are injected, `none` and the other detectors.
+        """
         protectors = tuple(name for name in self.detectors if name != NONE)
         return (GOLDEN, NONE, *protectors) if self.inject else (GOLDEN,)
 
     def described(self) -> ComparedPlan:
-        """Return the plan with descriptions of the platforms."""
+        """Return the plan for the report, with a summary of each platform in place of its name."""
         own = {part.name: getattr(self, part.name) for part in fields(self)}
         return ComparedPlan(**{**own, "platforms": summaries(self.platforms)},
                             settings=self.settings)  # fmt: skip
 
     def spec(self) -> Spec:
-        """Return the specification of the campaign."""
+        """Return the specification of the campaign that flies this plan."""
         faults: dict[str, tuple[Any, ...]] = {
             "stage" if set(self.inject) <= set(STAGES) else "site": self.inject,
             **({} if self.field is None else {"field": (self.field,)}),
@@ -120,7 +125,7 @@ class ComparePlan:
 def compare(
     plan: ComparePlan, folder: Path, options: Options, spectator: Spectator
 ) -> PlatformComparison:
-    """Fly the missions that the folder does not have yet, and compare the platforms.
+    """Fly the missions of a plan that have no result in `folder` yet, and compare the platforms.
 
     Raises:
         ConfigError: the folder holds another comparison.

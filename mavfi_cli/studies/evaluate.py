@@ -2,8 +2,8 @@
 
 The folder contains the campaign `bare`, which is flown without detectors, and the subfolder
 `protected` with one campaign for each detector model. `bare` keeps its traces, which are replayed
-through the detectors. `protected` keeps only records. Its missions depend on which faults do harm
-without a detector.
+through the detectors. `protected` keeps only records. Which missions it contains depends on which
+faults do harm without a detector.
 """
 
 from __future__ import annotations
@@ -77,23 +77,27 @@ class _Site(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationPlan:
-    """Plan of an evaluation.
+    """The plan of an evaluation of detectors: which missions are flown, with which faults.
 
     Attributes:
-        detectors: names; `none` is always flown, named or not.
-        flights: missions per world that are flown with faults: once for each site, with one fault.
+        detectors: names; `none` is always flown, even if it is not named.
+        flights: number of missions per world that are flown with faults: once for each of `places`,
+            with one fault.
         harmless_flights: number of these missions, starting with the first, in which all faults are
-            repeated with the detectors; in the others, only harmful faults are.
-        golden_flights: error-free missions per world; the first `flights` of them also get faults.
+            repeated with the detectors. In the other missions, only harmful faults are repeated.
+        golden_flights: number of error-free missions per world; the first `flights` of them also
+            get faults.
         first_seed: first seed of the missions; training seeds start at 10 000.
-        models: folder of model files `NAME.json`; None means those shipped for the stack of `base`.
+        models: folder of model files `NAME.json`; None means the models shipped for the stack of
+            `base`.
         level: source or instruction.
         fields: bit fields to strike at source level.
         seed: root of the faults' seeds.
         base: the other parameters of all missions.
 
     Raises:
-        ConfigError, UnknownName: a name is missing, unknown or named twice.
+        ConfigError, UnknownName: a list of names is empty, or contains a name that is unknown or
+            repeated.
     """
 
     worlds: tuple[str, ...] = WORLDS
@@ -127,19 +131,19 @@ class EvaluationPlan:
         return range(self.first_seed, self.first_seed + self.golden_flights)
 
     def complete(self, seed: int) -> bool:
-        """Return True if all faults of a mission, even harmless ones, are flown with detectors."""
+        """Return True if even the harmless faults of this seed are flown with detectors."""
         return seed in self.seeds[: self.harmless_flights]
 
     def detector_config(self, detector: str) -> DetectorConfig:
-        """Return the configuration of a detector for missions.
+        """Return the configuration with which missions run a detector.
 
         Raises:
-            ModelError: the folder of models has no such file.
+            ModelError: the folder `models` has no file for this detector.
         """
         return DetectorConfig.with_model(detector, self.models, self.protect)
 
     def require_held_out(self) -> None:
-        """Reject detectors that cannot be loaded, and seeds on which a model was trained.
+        """Check that every detector can be loaded, and was not trained on a seed of this plan.
 
         A seed is rejected whatever its world, because two worlds may use the same random numbers.
 
@@ -153,14 +157,14 @@ class EvaluationPlan:
                 seed = flight.rpartition("/")[2]
                 if seed.isdigit() and int(seed) in self.seeds:
                     raise ModelError(
-                        f"{detector.name} was fitted to the flight {flight}: seeds "
+                        f"{detector.name} was fitted to the flight {flight}, so seeds "
                         f"{self.seeds.start} to {self.seeds.stop - 1} are not held out; choose "
                         "another --first-seed",
                         path=path,
                     )
 
     def described(self) -> EvaluatedPlan:
-        """Return the plan with thresholds and digests of the models."""
+        """Return the plan for the report, with each detector's threshold and model digest."""
         stack = self.base.stack
         configs = [self.detector_config(name) for name in self.protectors]
         return EvaluatedPlan(
@@ -177,7 +181,10 @@ class EvaluationPlan:
         )
 
     def places(self) -> list[_Site]:
-        """List the sites of faults: nodes at instruction level, else stages with a bit field."""
+        """List the sites at which the plan injects faults.
+
+        At instruction level, these are nodes. At source level, each is a stage with a bit field.
+        """
         if self.level == INSTRUCTION:
             return [_Site(stage.value, node, Field.ANY.value) for node, stage in _NODES.items()]
         return [
@@ -192,8 +199,9 @@ class EvaluationPlan:
         """List the golden missions, then those with a fault, all with the given detector.
 
         Args:
-            harmful: world, seed, stage, target and field of the faults that do harm without a
-                detector. These, and all faults of complete missions, are flown with detectors.
+            harmful: world, seed, stage, target and field of each fault that does harm without a
+                detector. With a detector, only these faults are flown, and all faults of those
+                missions for which `complete` returns True.
         """
         golden = itertools.product(self.worlds, self.seeds)
         faulty = itertools.product(self.worlds, self.seeds[: self.flights], self.places())
@@ -232,18 +240,19 @@ class EvaluationPlan:
             # Redraw until the state has the required type; all such states are equally likely.
             if (fault.draw().states[0].dtype is DType.FLOAT64) is not whole:
                 return {"fault": fault}
-        raise ConfigError(f"no state of {site.target} has a bit field {site.field}")
+        raise ConfigError(f"no state of the stage {site.target} has the bit field {site.field}")
 
 
 def evaluate(
     plan: EvaluationPlan, folder: Path, options: Options, spectator: Spectator
 ) -> tuple[Evaluation, tuple[pa.Table, pa.Table]]:
-    """Fly the missions that the folder does not have yet, and evaluate the detectors.
+    """Fly the missions of a plan that have no result in `folder` yet, and evaluate the detectors.
 
-    A larger plan of the same kind extends a smaller one.
+    If the folder holds the flights of a smaller plan of the same kind, they are used again.
 
     Returns:
-        The evaluation, and its two tables of pairs: without faults, and with one.
+        The evaluation, and the two tables of pairs from which it is computed: pairs without a
+        fault, and pairs with one.
 
     Raises:
         UnknownName, VehicleProcessError: a world or platform does not exist.
@@ -280,9 +289,11 @@ def evaluate(
 def evaluation_of(
     plan: EvaluationPlan, pairs: tuple[pa.Table, pa.Table], errors: Sequence[str], scored: Scored
 ) -> Evaluation:
-    """Compute the results of these pairs.
+    """Compute the evaluation of a plan from its pairs of flights.
 
     Args:
+        pairs: as `analysis.detectors.pairs_of` returns them.
+        errors: labels and reason of each mission that could not begin.
         scored: see `analysis.detectors.results`.
     """
     return results(

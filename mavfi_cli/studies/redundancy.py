@@ -1,4 +1,4 @@
-"""`mavfi vpm --fly`: fly every vehicle of the model with every scheme, and compare.
+"""`mavfi vpm --fly`: fly every vehicle of the model with every scheme, and compare with the model.
 
 The simulated vehicle and platform are TOML files, which a mission refers to by path. The name of
 each file contains a digest of its contents, so equal names mean equal flights.
@@ -56,11 +56,12 @@ WORLDS = ("sparse", "dense")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightPlan:
-    """Plan of the flights of a vehicle with a scheme.
+    """The plan of the flights of one vehicle with one protection scheme.
 
     Attributes:
-        mission: the mission; `RedundancyPlan.missions_of` sets its world and seed.
-        files: contents of the files of vehicle and platform, by path.
+        mission: the mission to fly; `RedundancyPlan.missions_of` sets its world and seed.
+        files: contents of the TOML files of the vehicle and the platform, by path.
+        setup: parameters of the vehicle that the comparison with the model needs.
     """
 
     mission: MissionConfig
@@ -78,18 +79,19 @@ class FlightPlan:
         models: Path | None = None,
         stack: str = DEFAULT,
     ) -> FlightPlan:
-        """Plan the flights of a scheme at the model's safe velocity.
+        """Plan the flights of a scheme at the safe velocity that the model predicts for it.
 
         Args:
-            platform: platform whose latencies are scaled to the model's response time.
-            chain_s: response time of that platform in the model.
+            platform: platform whose latencies are scaled to the computer's response time in the
+                model.
+            chain_s: response time of `platform`, before it is scaled.
             folder: absolute path of the folder for the files.
-            models: folder of model files NAME.json; None means the shipped ones.
+            models: folder of detector models NAME.json; None means the shipped ones.
 
         Raises:
             CannotLift: the rotors cannot lift this many boards.
             ConfigError: the model's numbers are not valid for a mission.
-            ModelError: the folder lacks the detector's model.
+            ModelError: the folder `models` lacks the detector's model.
         """
         performance, boards_w = inputs.performance(scheme), scheme.copies * inputs.board.power_w
         velocity, cut_v = _within("v_max_mps", performance.velocity_mps, "velocity", "m/s")
@@ -128,7 +130,11 @@ class FlightPlan:
         )
 
     def write(self) -> None:
-        """Write the files. Raises RecordError if one cannot be written."""
+        """Write the TOML files of the vehicle and the platform.
+
+        Raises:
+            RecordError: a file cannot be written.
+        """
         for path, text in self.files.items():
             with writing(path.parent):
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -136,7 +142,10 @@ class FlightPlan:
 
 
 def _vehicle(inputs: ModelInputs, scheme: Scheme, acceleration_mps2: float) -> dict[str, Any]:
-    """Return the simulated equivalent of a vehicle, with a scheme's boards and heat sinks."""
+    """Return the vehicle file of the simulated equivalent of the model's vehicle, as a dict.
+
+    The simulated vehicle carries the scheme's boards and heat sinks.
+    """
     vehicle, board, boards = inputs.vehicle, inputs.board, scheme.copies
     return {
         "name": f"{vehicle.name}-{scheme.name}",
@@ -164,7 +173,11 @@ def _platform(platform: PlatformProfile, factor: float) -> dict[str, Any]:
 
 
 def _within(key: str, wanted: float, what: str, unit: str) -> tuple[float, str]:
-    """Return the nearest value that a mission allows, and a phrase if that is not `wanted`."""
+    """Clip a value to the limits of the mission parameter `key`.
+
+    Returns:
+        The clipped value, and a phrase that describes the change, which is empty if there is none.
+    """
     low, high = LIMITS[key]
     taken = min(max(wanted, low), high)
     change = f"{what} {taken:g} {unit} instead of {wanted:.4g} {unit}"
@@ -179,19 +192,19 @@ def _file(folder: Path, stem: str, values: Mapping[str, Any]) -> tuple[Path, str
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RedundancyPlan:
-    """Plan of the flights of all vehicles and schemes.
+    """The plan of the flights of all vehicles of the performance model with all schemes.
 
     Attributes:
-        missions: number per scheme and world.
+        missions: number of missions per vehicle, scheme and world.
         folder: folder of flights and pictures; recorded missions are not flown again.
         models: folder of the detectors' models; None means the shipped ones.
         train: number of error-free flights per training world for fitting the detectors of each
-            vehicle; 0 fits none.
+            vehicle; with 0, no detectors are fitted.
         stack: stack of all flights.
 
     Raises:
-        ConfigError, UnknownName: no world is named, one is named twice, or the missions use seeds
-            of the training flights, which are reserved in all worlds.
+        ConfigError, UnknownName: no world is named, a world is named twice, or the missions use
+            seeds of the training flights, which are reserved in all worlds.
     """
 
     vehicles: Sequence[ModelVehicle]
@@ -216,7 +229,7 @@ class RedundancyPlan:
 
     @property
     def origin_of_models(self) -> str:
-        """Origin of the detectors' models."""
+        """A phrase that says where the detectors' models come from."""
         if self.train:
             return (
                 f"fitted for each vehicle to {self.train} error-free flights in each of "
@@ -227,7 +240,13 @@ class RedundancyPlan:
         return "the shipped ones, fitted to flights of the Solo at 3 m/s"
 
     def missions_of(self, plans: Mapping[Key, FlightPlan]) -> list[PlannedMission]:
-        """List the missions, by seed first, so that an interrupted campaign has complete pairs."""
+        """List the missions that fly `plans`, ordered by seed.
+
+        In this order, an interrupted campaign has complete pairs.
+
+        Args:
+            plans: flight plans by vehicle and scheme.
+        """
         seeds = range(self.first_seed, self.first_seed + self.missions)
         return [
             PlannedMission(
@@ -248,7 +267,13 @@ def _plans_of(
     options: Options,
     spectator: Spectator,
 ) -> Iterator[tuple[Key, FlightPlan | str]]:
-    """Yield each scheme's plan, or the reason why it cannot fly; BASE must be the first scheme."""
+    """Yield the flight plan of each scheme of a vehicle, or the reason why it cannot be flown.
+
+    Files of vehicles and platforms are written, and detectors are fitted if the plan requires it.
+
+    Args:
+        schemes: BASE must be the first one.
+    """
     platform = plan.choices.platform or load_platform(PLATFORM)
     chain_s = CHAINS[plan.choices.chain][0]([k.latency_s for k in platform.kernels.values()])
     inputs, models = plan.choices.inputs(vehicle), plan.models
@@ -274,10 +299,10 @@ def _plans_of(
 def fitted(
     plan: RedundancyPlan, vehicle: str, flown: FlightPlan, options: Options, spectator: Spectator
 ) -> Path:
-    """Fit detectors to error-free flights of a plan; return the folder of their models.
+    """Fit detectors to error-free flights of one vehicle, and return the folder of their models.
 
-    Models that already exist are reused. The folder's name contains a digest of the mission and of
-    the number of flights.
+    The flights are those of the mission in `flown`. Models that already exist are reused. The
+    folder's name contains a digest of the mission and of the number of flights.
 
     Raises:
         ModelError: too few flights reached their goals, or torch is missing.
@@ -298,13 +323,13 @@ def fly_and_report(
     options: Options,
     spectator: Spectator,
 ) -> tuple[ModelReport, FlightsReport]:
-    """Fly all vehicles with all schemes; return the reports of the model and of the flights.
+    """Fly all vehicles with all schemes, and return the reports of the model and of the flights.
 
-    The flights, and the model compared with them, use the given overheads, or else the paper's. The
-    report of the model uses the given overheads, or else those measured in the flights.
+    For detectors without a given overhead, the flights, and the model compared with them, use the
+    paper's overhead. The report of the model uses the overhead measured in the flights.
 
     Args:
-        overheads: overhead in per cent and its source, by the detector's name.
+        overheads: overhead in per cent of the compute time, and its source, by the detector's name.
 
     Raises:
         MavfiError: as `run_campaign`; or a world or vehicle does not exist.

@@ -1,4 +1,4 @@
-"""The spread of repeated fault-free flights of a user's companion: outcome, time and path.
+"""How outcome, time and path vary over repeated fault-free flights of a user's companion.
 
 Such a flight is not repeatable, so every effect of a fault must be compared with this spread.
 """
@@ -22,14 +22,14 @@ from mavfi_cli.stats.shares import wilson
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
-    """The spread of repeated flights.
+    """How much the outcome, flight time and path of repeated flights of one mission vary.
 
     Attributes:
         outcomes: Number of flights by outcome.
         succeeded: Success rate, and the ends of its 95 % interval (Wilson).
         flight_time_s: Smallest, median and largest time of a successful flight, s.
-        apart_m: Median and maximum, over the later successful flights, of the largest distance
-            from the path of the first one, m.
+        apart_m: Largest distance of each later successful flight from the path of the first one, m:
+            median and maximum over these flights.
     """
 
     outcomes: dict[str, int]
@@ -39,7 +39,7 @@ class Spread:
 
     @classmethod
     def of(cls, runs: Sequence[Run]) -> Spread:
-        """Compare flights. A number is NaN if no flight provides it."""
+        """Compare repeated flights. A number is NaN if no flight provides it."""
         good = [run for run in runs if run.record.succeeded]
         share = wilson(len(good), len(runs))
         qualities = [run.record.quality_of_flight for run in good]
@@ -56,7 +56,7 @@ class Spread:
         )
 
     def lines(self) -> list[str]:
-        """Describe the spread."""
+        """Return lines of text on the outcomes, the flight times and the paths."""
         total = sum(self.outcomes.values())
         share, low, high = (100.0 * value for value in self.succeeded)
         flown = ", ".join(f"{name} {count}" for name, count in sorted(self.outcomes.items()))
@@ -69,7 +69,7 @@ class Spread:
         ]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values; NaN becomes None."""
+        """Return the attributes as plain values, with None in place of NaN."""
         return {
             name: [_known(number) for number in value] if isinstance(value, tuple) else value
             for name, value in asdict(self).items()
@@ -77,7 +77,7 @@ class Spread:
 
 
 def fly_spread(config: MissionConfig, count: int, out: Path, watcher: Watcher) -> Spread:
-    """Fly the golden mission several times, one after the other, and compare the flights.
+    """Fly the golden run of a mission `count` times, one after the other, and compare the flights.
 
     Raises:
         Interrupted: The user interrupted the flights.
@@ -91,7 +91,10 @@ def fly_spread(config: MissionConfig, count: int, out: Path, watcher: Watcher) -
 
 
 def _at(values: Sequence[float], share: float) -> float:
-    """Return a quantile of sorted values, the upper of two neighbours; NaN without values."""
+    """Return the quantile `share` of sorted values, or NaN if there are none.
+
+    If the quantile lies between two values, the upper one is returned.
+    """
     return values[min(int(share * len(values)), len(values) - 1)] if values else math.nan
 
 

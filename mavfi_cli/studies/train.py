@@ -1,4 +1,4 @@
-"""`mavfi train`: error-free flights, the data set of their samples, and the models fitted to it.
+"""`mavfi train`: fly error-free missions, collect their samples in a data set, and fit detectors.
 
 The default is the paper's training set (section VI): two obstacle densities times two obstacle
 sizes, 25 flights each. Every flight has its own world seed.
@@ -35,15 +35,17 @@ TRAINING_WORLDS = ("train-0.05-3", "train-0.05-5", "train-0.2-3", "train-0.2-5")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingPlan:
-    """Plan of the flights and of the fit.
+    """The plan of a training: which error-free flights are used, and which detectors are fitted.
 
     Attributes:
-        flights: number per world.
+        flights: number of flights per world.
         first_seed: seed of the first flight; the seeds are consecutive over all worlds.
-        seed: seed of the split and of the initial weights.
+        seed: seed of the split of the data and of the initial weights.
         n_sigma: threshold of the Gaussian model; None lets `fit` choose it.
-        flown: folder of run folders to fit to; None flies the missions.
-        logs: .tlog files of a user's companion, from fault-free flights, to fit to instead.
+        kinds: the detectors to fit.
+        base: the other parameters of all missions.
+        flown: folder with the run folders of existing flights to use; None flies the missions.
+        logs: .tlog files of fault-free flights of a user's companion, to use instead.
     """
 
     worlds: tuple[str, ...] = TRAINING_WORLDS
@@ -57,7 +59,7 @@ class TrainingPlan:
     logs: tuple[Path, ...] = ()
 
     def missions(self) -> list[PlannedMission]:
-        """List the flights, world by world."""
+        """List the missions to fly, world by world."""
         return [
             PlannedMission(
                 config=replace(
@@ -76,11 +78,11 @@ def train(
     """Fly or collect flights, fit the detectors, and write the models with their provenance.
 
     Returns:
-        The data set; model and file of each detector; and the number of flights left out because
-        they were not error-free.
+        The data set; the model and its file, by detector; and the number of flights that were left
+        out because they were not error-free.
 
     Raises:
-        UnknownName: a kind is unknown; raised before anything is flown.
+        UnknownName: a kind of detector is unknown; raised before anything is flown.
         ModelError: there are too few flights, or torch is missing; raised before anything is flown.
             Or too few of the flights are error-free, or a log contains no setpoint.
         ConfigError: n sigma is out of range, the folder has the flights of another plan, or the
@@ -124,7 +126,10 @@ def train(
 
 
 def _mark_of(plan: TrainingPlan) -> StackMark:
-    """Return the identity of the flown software: its stack, its companion, or a mark for logs."""
+    """Return the identity of the software that flew: its stack, its companion, or a mark for logs.
+
+    The models store this identity.
+    """
     if plan.base.companion is not None:
         return CompanionConfig.load(plan.base.companion).mark
     if plan.logs:

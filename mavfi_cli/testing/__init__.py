@@ -1,4 +1,6 @@
-"""Contract suites for plug-ins, run by pytest. Subclass one in a test module.
+"""Test suites that check whether a plug-in keeps its contract. Subclass one in a test module.
+
+pytest then runs its tests:
 
 from mavfi_cli.testing import PlannerContract
 

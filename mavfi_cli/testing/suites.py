@@ -1,4 +1,4 @@
-"""Contract tests of detectors, planners and transports."""
+"""The contract suites of detectors, planners and transports."""
 
 from __future__ import annotations
 
@@ -43,7 +43,10 @@ def _single(place: int, delta: int) -> Deltas:
 
 
 def _samples(count: int = 60, seed: int = 3) -> Deltas:
-    """Return small changes, as in flights, and a few large ones."""
+    """Return random deltas of shape (count, COUNT), one sample per row.
+
+    Changes are small, as in flights, except in every tenth sample.
+    """
     rng = np.random.default_rng(seed)
     drawn = rng.integers(-2, 3, size=(count, COUNT)) * (rng.random((count, COUNT)) < 0.2)
     drawn[::10] *= 100
@@ -65,7 +68,7 @@ def _run(detector: Detector, rows: Iterable[Deltas]) -> list[float]:
 
 
 class DetectorContract:
-    """The suite that every registered detector passes.
+    """The tests that every registered detector must pass. Subclass it to test a detector.
 
     Attributes:
         detector: Name of the detector's entry point, set by the subclass.
@@ -149,7 +152,7 @@ class DetectorContract:
         assert not _alarms(detector, change, Stage.CONTROL)
 
     def test_a_broken_memory_is_never_silent(self, name: str) -> None:
-        """A score raises an alarm if any number that it depends on is NaN."""
+        """A score that depends on a NaN in the detector's memory raises an alarm."""
         for key in base.find_detector(name).memory:
             for place in range(base.find_detector(name).memory[key].size):
                 healthy, broken = base.find_detector(name), base.find_detector(name)
@@ -240,7 +243,10 @@ def _closed_box(around: FloatArray, half: float = 3.0) -> MapSnapshot:
 
 
 def _clearance(path: FloatArray, snapshot: MapSnapshot) -> float:
-    """Return the distance between a path, sampled every 5 cm, and the map, by FCL."""
+    """Return the smallest distance, in metres, between a path and the occupied voxels of a map.
+
+    The path is sampled every 5 cm, and the library FCL computes the distances.
+    """
     tree = fcl.CollisionObject(fcl.OcTree(snapshot.resolution_m, snapshot.signed_bytes()))
     smallest = np.inf
     for start, end in itertools.pairwise(path):
@@ -254,7 +260,7 @@ def _clearance(path: FloatArray, snapshot: MapSnapshot) -> float:
 
 
 class PlannerContract:
-    """The suite that every registered planner passes.
+    """The tests that every registered planner must pass. Subclass it to test a planner.
 
     Attributes:
         planner: Name of the planner's entry point, set by the subclass.
@@ -264,7 +270,11 @@ class PlannerContract:
 
     @staticmethod
     def wall_with_gap(gap_m: float = 4.0) -> MapSnapshot:
-        """Return a wall across the bounds with a gap at y = 6."""
+        """Return a map with a wall across the bounds at x = 10 m that has a gap at y = 6 m.
+
+        Args:
+            gap_m: width of the gap.
+        """
         below = _slab((10, -13, 0), (10.4, 6 - gap_m / 2, 11))
         above = _slab((10, 6 + gap_m / 2, 0), (10.4, 13, 11))
         return MapSnapshot.of_points(np.vstack([below, above]))
@@ -276,7 +286,10 @@ class PlannerContract:
         goal: FloatArray = GOAL,
         params: PlanningParams = PARAMS,
     ) -> PlanningProblem:
-        """Return the problem of planning a path in a map from start to goal, both (3,), ENU, m."""
+        """Return the problem of planning a path through a map from a start to a goal.
+
+        Both positions have the shape (3,) and are in ENU, in metres.
+        """
         return PlanningProblem.pose(snapshot, start, goal, BOUNDS, params)
 
     @pytest.fixture
@@ -364,26 +377,26 @@ WAIT_S = 5.0
 
 
 class TransportContract:
-    """The suite that every transport passes.
+    """The tests that every transport must pass. Subclass it to test a transport.
 
-    A subclass has a fixture `pair` that yields two connected ends and closes them afterwards. The
-    second end opens the connection.
+    The subclass needs a fixture `pair` that yields the two ends of a connection and closes them
+    afterwards. The second end is the one that opens the connection.
     """
 
     @staticmethod
     def message(number: int) -> object:
-        """Return a MAVLink message that contains a number."""
+        """Return a MAVLink message that contains `number`, so that its receiver can identify it."""
         return dialect.MAVLink_local_position_ned_message(number, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0)
 
     @staticmethod
     def send(transport: Transport, codec: Codec, numbers: range) -> None:
-        """Send one message per number in one batch."""
+        """Encode one message per number, and send all of them in one batch."""
         messages = map(TransportContract.message, numbers)
         transport.send(b"".join(map(codec.encode, messages)))
 
     @staticmethod
     def receive(transport: Transport, count: int) -> list[int]:
-        """Receive messages until there are `count`; return their numbers."""
+        """Receive messages until at least `count` have arrived, and return their numbers."""
         codec = Codec(7, 7)
         numbers: list[int] = []
         while len(numbers) < count:
@@ -395,7 +408,7 @@ class TransportContract:
 
     @staticmethod
     def introduce(near: Transport, far: Transport) -> None:
-        """Send from the second end first, so that a listening end learns its address."""
+        """Send a message from the second end to the first, so that the first learns its address."""
         TransportContract.send(far, Codec(2, 2), range(1))
         assert TransportContract.receive(near, 1) == [0]
 
@@ -427,7 +440,7 @@ class TransportContract:
 
 
 class StreamTransportContract(TransportContract):
-    """The suite for transports, such as TCP, in which an end learns that the other has closed."""
+    """The tests for transports in which an end notices that the other has closed, such as TCP."""
 
     def test_a_closed_stream_is_a_lost_link_at_the_other_end(self, pair: Pair) -> None:
         near, far = pair

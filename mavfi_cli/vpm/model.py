@@ -30,7 +30,7 @@ BOARDS = Shipped("board", Path(__file__).parent / "boards")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Calibration:
-    """An unpublished number, chosen so that the model reproduces one published ratio."""
+    """An unpublished parameter of a vehicle, and the published ratio that determines it."""
 
     parameter: str  # one of CALIBRATED
     board: str  # the shipped board of the redundant computers
@@ -46,7 +46,10 @@ class _Calibration:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelVehicle:
-    """A quadrotor in the model; a number is None if a calibration or a platform gives it."""
+    """A quadrotor as the model sees it.
+
+    A parameter is None if its value comes from a calibration or from the platform.
+    """
 
     name: str  # name of the vehicle
     mass_kg: float  # frame, rotors and battery, without the boards
@@ -79,38 +82,40 @@ class ModelVehicle:
             raise ValueError(f"tilt_deg: must be between 0 and 90, got {self.tilt_deg:g}")
         free = self.calibration.parameter if self.calibration else ""
         if free and getattr(self, free) is not None:
-            raise ValueError(f"{free}: has a value, so it cannot be calibrated")
+            raise ValueError(
+                f"{free}: has a value, so it cannot be calibrated; remove it or [calibration]"
+            )
         if self.rotor_pull_n is None and free != "rotor_pull_n":
-            raise ValueError("rotor_pull_n: missing, and no calibration sets it")
+            raise ValueError("rotor_pull_n: missing; give it, or calibrate it in [calibration]")
         if free == "rotor_pull_n" and self.response_s is None:
-            raise ValueError("response_s: missing, and the calibration needs it")
+            raise ValueError("response_s: missing; the calibration of rotor_pull_n needs it")
 
     @classmethod
     def load(cls, name_or_path: str) -> ModelVehicle:
-        """Load a shipped vehicle by name, or a user's own by the path of its TOML file.
+        """Load a shipped vehicle by its name, or a user's vehicle by the path of its TOML file.
 
         Raises:
             UnknownName: no shipped vehicle has this name, and it is not a path to a TOML file.
-            ConfigError: the file cannot be used.
+            ConfigError: the file cannot be read, or it contains an invalid value.
         """
         return load_toml(VEHICLES.path(name_or_path), cls)
 
     @property
     def stand_in(self) -> str:
-        """The simulated vehicle that flies in place of this one."""
+        """Name of the simulated vehicle that flies missions in place of this one."""
         if self.flies_as:
             return self.flies_as
         return "spark" if self.mass_kg < SMALL_KG else "solo"
 
     @property
     def tilt_rad(self) -> float:
-        """Angle between the thrust and the vertical, rad."""
+        """Angle between the thrust and the vertical while braking, in radians."""
         return math.radians(self.tilt_deg)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Board:
-    """One copy of the computer that the vehicle carries."""
+    """A computer that a vehicle carries. Redundancy needs several copies of it."""
 
     name: str  # name of the board
     mass_kg: float  # mass without the heat sink
@@ -124,17 +129,20 @@ class Board:
 
     @property
     def total_kg(self) -> float:
-        """Mass of a board and its heat sink, kg."""
+        """Mass of one board with its heat sink, in kg."""
         return self.mass_kg + self.heatsink_kgpw * self.power_w
 
     @classmethod
     def load(cls, name_or_path: str) -> Board:
-        """Load a shipped board by name or a user's by path; raises as `ModelVehicle.load`."""
+        """Load a shipped board by its name, or a user's board by the path of its TOML file.
+
+        Raises the same errors as `ModelVehicle.load`.
+        """
         return load_toml(BOARDS.path(name_or_path), cls)
 
     @classmethod
     def of_platform(cls, platform: PlatformProfile) -> Board:
-        """Return a platform's board; mass and power are 0 if it stays on the ground."""
+        """Return the board of a platform. If it stays on the ground, its mass and power are 0."""
         name = f"platform {platform.name}"
         sources = {key: f"{name}: {platform.sources.get(key, 'not given')}" for key in HARDWARE}
         if not platform.carried:
@@ -152,7 +160,10 @@ REFERENCE = "aad"  # scheme with which the paper's Fig. 15 compares redundancy
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scheme:
-    """A way to protect the computer from faults; `none` protects nothing."""
+    """A scheme that protects the computer from faults, by redundant boards or by a detector.
+
+    The scheme named `none` gives no protection.
+    """
 
     name: str
     title: str
@@ -175,11 +186,11 @@ DETECTORS = tuple(scheme.name for scheme in _SCHEMES if scheme.overhead > 0.0)
 
 
 def schemes_with(overheads: Mapping[str, tuple[float, str]]) -> dict[str, Scheme]:
-    """Return the schemes by name, with measured overheads in place of the paper's.
+    """Return all protection schemes by name, with some of the paper's overheads replaced.
 
     Args:
-        overheads: detector name -> its overhead in per cent of the compute time, and the source
-            of that number.
+        overheads: for each detector whose overhead is to be replaced, the new overhead in per cent
+            of the compute time, and the source of this number.
 
     Raises:
         UnknownName: a name is not that of a scheme with detection and recovery.
@@ -204,23 +215,24 @@ Number = TypeVar("Number", float, NDArray[np.float64])
 
 
 def acceleration_mps2(pull_n: float, mass_kg: float, tilt_rad: float = 0.0) -> float:
-    """Return the largest acceleration, CAL20 equation 2: (T cos(tilt) - m g) / m.
+    """Return the largest acceleration, in m/s^2: (T cos(tilt) - m g) / m (CAL20, equation 2).
 
-    If it is zero or less, the vehicle cannot lift its mass.
+    If the result is zero or less, the vehicle cannot lift its mass.
 
     Args:
         pull_n: thrust of all rotors at full throttle, N.
         mass_kg: mass of everything that flies, kg.
-        tilt_rad: tilt, rad; 0 reproduces the paper's Table 1.
+        tilt_rad: angle between the thrust and the vertical, rad; 0 reproduces the paper's Table 1.
     """
     return pull_n * math.cos(tilt_rad) / mass_kg - GRAVITY_MPS2
 
 
 def safe_velocity_mps(accel_mps2: float, response_s: Number, range_m: float) -> Number:
-    """Return the velocity from which the vehicle stops within `range_m`, CAL20 equation 3.
+    """Return the highest velocity, in m/s, from which the vehicle can stop within `range_m`.
 
-    v = a (sqrt(T^2 + 2 d / a) - T), the root of d = v T + v^2 / (2 a), written here without the
-    difference of two nearly equal numbers: v = 2 d / (T + sqrt(T^2 + 2 d / a)).
+    This is CAL20, equation 3, for response time T and range d: v = a (sqrt(T^2 + 2 d / a) - T), the
+    root of d = v T + v^2 / (2 a). It is written here without the difference of two nearly equal
+    numbers: v = 2 d / (T + sqrt(T^2 + 2 d / a)).
 
     Args:
         accel_mps2: acceleration, m/s^2, above zero.
@@ -232,23 +244,27 @@ def safe_velocity_mps(accel_mps2: float, response_s: Number, range_m: float) -> 
 
 
 def roof_mps(accel_mps2: float, range_m: float) -> float:
-    """Return the velocity limit of the body dynamics at zero response time, m/s: sqrt(2 d a)."""
+    """Return the roof in m/s: the safe velocity if the response time were zero, sqrt(2 d a).
+
+    Only the body dynamics limit it.
+    """
     return math.sqrt(2.0 * range_m * accel_mps2)
 
 
 def knee_hz(accel_mps2: float, range_m: float, share: float = KNEE_SHARE) -> float:
-    """Return the action throughput, Hz, at which the safe velocity is `share` of the roof.
+    """Return the action throughput, in Hz, at which the safe velocity is `share` times the roof.
 
-    It is equation 3 solved for the throughput: f = sqrt(a / (2 d)) 2 share / (1 - share^2).
+    The roof is that of `roof_mps`. The result is CAL20, equation 3, solved for the throughput:
+    f = sqrt(a / (2 d)) 2 share / (1 - share^2).
     """
     return math.sqrt(accel_mps2 / (2.0 * range_m)) * 2.0 * share / (1.0 - share**2)
 
 
 def hover_power_w(known_w: float, known_kg: float, mass_kg: float) -> float:
-    """Return the rotor power in hover at another mass, W, by momentum theory.
+    """Return the rotor power, in watts, for hovering with mass `mass_kg`.
 
-    P ~ (m g)^1.5 / sqrt(2 rho A). The disc area and the figure of merit do not change, so one known
-    pair of power and mass is enough.
+    Momentum theory gives P ~ (m g)^1.5 / sqrt(2 rho A). The disc area and the figure of merit do
+    not change with the mass, so one known pair of power and mass is enough.
     """
     return float(known_w * (mass_kg / known_kg) ** 1.5)
 
@@ -258,7 +274,7 @@ _J_PER_WH = 3600.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Performance:
-    """Performance of a vehicle with a scheme, on a straight path at hover power."""
+    """The performance of a vehicle with a protection scheme, on a straight path at hover power."""
 
     thrust_to_weight: float
     acceleration_mps2: float
@@ -278,7 +294,7 @@ class Performance:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelInputs:
-    """The model's inputs for one vehicle with its computer."""
+    """The model's inputs for one vehicle and the computer that it carries."""
 
     vehicle: ModelVehicle
     board: Board
@@ -288,43 +304,52 @@ class ModelInputs:
     distance_m: float
 
     def carried_kg(self, copies: int) -> float:
-        """Return the mass of this many boards and their heat sinks, kg."""
+        """Return the mass of `copies` boards with their heat sinks, in kg."""
         return copies * self.board.total_kg
 
     def mass_kg(self, copies: int) -> float:
-        """Return the mass of everything that flies, kg."""
+        """Return the total mass of the vehicle and `copies` boards with heat sinks, in kg."""
         return self.vehicle.mass_kg + self.carried_kg(copies)
 
     def acceleration_mps2(self, copies: int) -> float:
-        """Return the largest acceleration, m/s^2; zero or less if the boards are too heavy."""
+        """Return the largest acceleration with `copies` boards, in m/s^2.
+
+        It is zero or less if the vehicle cannot lift the boards.
+        """
         return acceleration_mps2(self.pull_n, self.mass_kg(copies), self.vehicle.tilt_rad)
 
     def response_s(self, overhead: float = 0.0) -> float:
-        """Return the response time, s, CAL20 equation 1: the slower of sensor and computer."""
+        """Return the response time in seconds: the sensor's or computer's, whichever is longer.
+
+        This is CAL20, equation 1.
+
+        Args:
+            overhead: additional compute time, as a fraction of that without protection.
+        """
         return max(1.0 / self.vehicle.sensor_hz, self.compute_s * (1.0 + overhead))
 
     def velocity_mps(self, scheme: Scheme) -> float | None:
-        """Return the safe velocity with a scheme, m/s; None if it makes the vehicle too heavy."""
+        """Return the safe velocity with a scheme, in m/s, or None if its boards are too heavy."""
         accel = self.acceleration_mps2(scheme.copies)
         if accel <= 0.0:
             return None
         return safe_velocity_mps(accel, self.response_s(scheme.overhead), self.range_m)
 
     def too_heavy(self, copies: int) -> CannotLift:
-        """Return the error that explains why this many boards are too heavy."""
+        """Return the error that explains why the vehicle cannot lift `copies` boards."""
         own_kg, compute_kg = self.vehicle.mass_kg, self.carried_kg(copies)
         limit_kg = self.mass_kg(copies) * (1.0 + self.acceleration_mps2(copies) / GRAVITY_MPS2)
         return CannotLift(
             f"vehicle {self.vehicle.name!r} cannot lift its compute: {self.pull_n:.2f} N of rotor "
-            f"pull lift less than {limit_kg:.3f} kg, {own_kg:.3f} kg + {compute_kg:.3f} kg of "
-            f"compute are {own_kg + compute_kg:.3f} kg"
+            f"pull lift less than {limit_kg:.3f} kg, but {own_kg:.3f} kg + {compute_kg:.3f} kg of "
+            f"compute weigh {own_kg + compute_kg:.3f} kg"
         )
 
     def performance(self, scheme: Scheme) -> Performance:
-        """Return the performance with a scheme.
+        """Return the vehicle's performance with a protection scheme.
 
         Raises:
-            CannotLift: the rotors cannot lift this many boards.
+            CannotLift: the rotors cannot lift the scheme's boards.
         """
         vehicle, copies = self.vehicle, scheme.copies
         accel, velocity = self.acceleration_mps2(copies), self.velocity_mps(scheme)

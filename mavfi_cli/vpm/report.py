@@ -27,7 +27,7 @@ from mavfi_cli.vpm.model import (
     safe_velocity_mps,
 )
 
-# How the latencies of a platform's kernels combine into one response time, and the word for it.
+# How the latencies of a platform's kernels combine into a response time: function and its name.
 CHAINS: dict[str, tuple[Callable[[list[float]], float], str]] = {
     "serial": (sum, "sum"),
     "pipelined": (max, "slowest"),
@@ -45,7 +45,7 @@ _BOARD_UNITS = {"mass_kg": "kg", "power_w": "W", "heatsink_kgpw": "kg/W"}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choices:
-    """The user's choices; None means the vehicle's own value."""
+    """The user's choices for the model. If a choice is None, the vehicle's own value is used."""
 
     platform: PlatformProfile | None = None
     chain: str = "serial"  # one of CHAINS
@@ -55,7 +55,9 @@ class Choices:
     distance_m: float = 50.0
 
     def inputs(self, vehicle: ModelVehicle) -> ModelInputs:
-        """Calibrate the vehicle's free number, if it has one, and return the model's inputs.
+        """Return the model's inputs for a vehicle with these choices.
+
+        If the vehicle has an unpublished parameter, it is calibrated first.
 
         Raises:
             ConfigError: neither the vehicle nor the choices give a required value, or a value
@@ -66,18 +68,18 @@ class Choices:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Parameter:
-    """A number that the model uses, with its source."""
+    """A parameter that the model uses, with its value and the source of the value."""
 
     parameter: str
     value: float
     unit: str
     source: str
-    calibrated: bool = False  # a published ratio determines it
+    calibrated: bool = False  # True if the value comes from a calibration
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ratios:
-    """Numbers of a scheme relative to those of the scheme REFERENCE."""
+    """The results with a protection scheme, each divided by that with the scheme REFERENCE."""
 
     velocity_ratio: float
     flight_time_ratio: float
@@ -87,7 +89,11 @@ class Ratios:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SchemeResult:
-    """The results for a vehicle with a scheme; if it is too heavy, `problem` explains why."""
+    """The results for a vehicle with a protection scheme.
+
+    If the vehicle cannot lift the scheme's boards, `performance` and `ratios` are None, and
+    `problem` explains why.
+    """
 
     scheme: str
     title: str
@@ -103,16 +109,16 @@ class SchemeResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensitivityPoint:
-    """The results at one value of a parameter; None if the vehicle cannot fly."""
+    """The results at one value of a varied parameter. They are None if the vehicle cannot fly."""
 
     value: float
-    velocity_mps: float | None  # with the scheme REFERENCE
-    tmr_flight_time_ratio: float | None  # over the scheme REFERENCE
+    velocity_mps: float | None  # safe velocity with the scheme REFERENCE
+    tmr_flight_time_ratio: float | None  # flight time with TMR over that with REFERENCE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sensitivity:
-    """The results as one parameter varies.
+    """How the results change as one parameter varies.
 
     An elasticity is d ln(result) / d ln(parameter) at `value`: the change of the result in per cent
     if the parameter changes by one per cent.
@@ -128,11 +134,12 @@ class Sensitivity:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibratedNumber:
-    """The free number that gives a vehicle its published ratio of flight times.
+    """A vehicle's unpublished parameter, calibrated to reproduce a published flight-time ratio.
 
     Attributes:
-        tmr_ratio, predicted_dmr_ratio: flight time with TMR and with DMR, each over that with the
-            scheme REFERENCE; only the first ratio is fitted.
+        tmr_ratio: flight time with TMR over that with the scheme REFERENCE, which is fitted to the
+            published ratio.
+        predicted_dmr_ratio: the same ratio with DMR, which is not fitted.
     """
 
     board: str
@@ -147,7 +154,10 @@ class CalibratedNumber:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Curves:
-    """Safe velocity against action throughput, (n,), for each number of boards that can fly."""
+    """Curves of the safe velocity over the action throughput, one for each number of boards.
+
+    All lists have the same length. Numbers of boards that the vehicle cannot lift are omitted.
+    """
 
     throughput_hz: list[float]
     velocity_mps: dict[int, list[float]]
@@ -155,7 +165,7 @@ class _Curves:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleReport:
-    """The model's numbers for one vehicle; the first calibration is the one in use."""
+    """The model's results for one vehicle. The first of `calibrations` is the one in use."""
 
     vehicle: str
     description: str
@@ -170,7 +180,10 @@ class VehicleReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelReport:
-    """The model's numbers; the names of all numbers except counts and ratios end in the unit."""
+    """The model's results for all vehicles.
+
+    The names of all numbers end in the unit, except those of counts and ratios.
+    """
 
     model: str = MODEL
     knee_velocity_over_roof_ratio: float = KNEE_SHARE
@@ -183,7 +196,7 @@ class ModelReport:
 def report(
     vehicles: Sequence[ModelVehicle], choices: Choices, schemes: Mapping[str, Scheme]
 ) -> ModelReport:
-    """Compute the model's numbers for each vehicle.
+    """Compute the model's results for each vehicle with each protection scheme.
 
     Raises:
         CannotLift: a vehicle cannot lift even one board.
@@ -198,7 +211,10 @@ def report(
 
 
 def _unlike_sources(schemes: Mapping[str, Scheme]) -> tuple[str, ...]:
-    """Return a note if one detector's overhead is from the paper and another's is not."""
+    """Return a note if only some of the detectors' overheads come from the paper.
+
+    Otherwise, return an empty tuple.
+    """
     detectors = [schemes[name] for name in DETECTORS]
     papers = [scheme.name for scheme in detectors if scheme.source == TABLE_V]
     others = [scheme.name for scheme in detectors if scheme.source != TABLE_V]
@@ -234,10 +250,10 @@ def _vehicle(
 def _inputs(
     vehicle: ModelVehicle, choices: Choices
 ) -> tuple[ModelInputs, tuple[_Parameter, ...], CalibratedNumber | None]:
-    """Return the model's inputs, a table of them with sources, and the calibration if there is one.
+    """Return the model's inputs, the table of parameters with their sources, and the calibration.
 
-    The response time comes from the command line, otherwise from the platform, otherwise from the
-    vehicle.
+    The calibration is None if the vehicle has no unpublished parameter. The response time is taken
+    from the command line, otherwise from the platform, otherwise from the vehicle.
     """
     full, sources, free, calibration = vehicle, dict(vehicle.sources), "", None
     if vehicle.calibration is not None:
@@ -255,8 +271,8 @@ def _inputs(
     elif platform is not None:
         if platform.measured_factor is not None:
             raise ConfigError(
-                f"{platform.name} has no fixed latencies; it measures them in flight "
-                "(mavfi fly --realtime)",
+                f"{platform.name} has no fixed latencies, because it measures them in flight: "
+                "give --response or another platform",
                 key="platform",
             )
         combined, how = CHAINS[choices.chain]
@@ -279,14 +295,14 @@ def _inputs(
 
 
 def _with_number(vehicle: ModelVehicle, parameter: str, value: float) -> ModelVehicle:
-    """Return the vehicle with a value for the number that is to be calibrated."""
+    """Return a copy of the vehicle in which the unpublished `parameter` has a value."""
     if parameter == "response_s":
         return replace(vehicle, calibration=None, response_s=value)
     return replace(vehicle, calibration=None, rotor_pull_n=value)
 
 
 def _with_board(vehicle: ModelVehicle, board: Board, distance_m: float) -> ModelInputs:
-    """Return the inputs for a vehicle whose numbers are all known."""
+    """Return the model's inputs for a board and a vehicle whose parameters are all known."""
     assert vehicle.rotor_pull_n is not None
     assert vehicle.response_s is not None
     return ModelInputs(
@@ -301,7 +317,10 @@ def _notes(
     inputs: ModelInputs,
     calibration: CalibratedNumber | None,
 ) -> list[str]:
-    """Describe values that another computer did not change, although a user may expect it to."""
+    """Return notes on values that the chosen computer did not change, though a user may expect it.
+
+    These are the response time and the calibrated parameter of the vehicle.
+    """
     notes, board = [], inputs.board
     own_time = choices.platform is None and choices.response_s is None
     calibrated_time = calibration is not None and calibration.parameter == "response_s"
@@ -454,24 +473,27 @@ def _elasticity(below: float | None, above: float | None) -> float | None:
 
 
 def _time_ratio(inputs: ModelInputs, schemes: Mapping[str, Scheme], scheme: str) -> float | None:
-    """Return the flight time of a scheme over that of REFERENCE; None if either cannot fly."""
+    """Return the flight time with a scheme divided by that with the scheme REFERENCE.
+
+    Return None if the vehicle cannot lift the boards of one of the two schemes.
+    """
     fast, slow = (inputs.velocity_mps(schemes[name]) for name in (REFERENCE, scheme))
     return None if fast is None or slow is None else fast / slow
 
 
-# Calibration: the one free number of a vehicle from one published ratio of flight times --------
+# Calibration: a vehicle's unpublished parameter from a published ratio of flight times ---------
 
 _SPAN = 1.0e4  # ratio of the largest to the smallest tried value
 _STEPS = 200  # halvings of the interval; more than a float can resolve
 
 
 def _calibrated(vehicle: ModelVehicle, board: Board | None = None) -> CalibratedNumber:
-    """Find the value of the vehicle's free number that gives its published ratio.
+    """Find the value of the vehicle's unpublished parameter that gives the published ratio.
 
-    The ratio falls as the free number grows, so bisection finds it.
+    The ratio of flight times falls as the parameter grows, so bisection finds the value.
 
     Args:
-        board: the board of the redundant computers; None takes the calibration's own.
+        board: the board of the redundant computers. If None, it is the calibration's own.
 
     Raises:
         ConfigError: no value gives the ratio; the message names the ratios that can be reached.
@@ -483,7 +505,7 @@ def _calibrated(vehicle: ModelVehicle, board: Board | None = None) -> Calibrated
     parameter, wanted = calibration.parameter, calibration.tmr_time_ratio
 
     def time_ratio(value: float, scheme: str = "tmr") -> float:
-        """Return the flight time of a scheme over REFERENCE's; infinite if either cannot fly."""
+        """Return the flight-time ratio for a value of `parameter`; infinity if it cannot fly."""
         inputs = _with_board(_with_number(vehicle, parameter, value), board, 1.0)
         ratio = _time_ratio(inputs, SCHEMES, scheme)
         return math.inf if ratio is None else ratio
@@ -496,8 +518,8 @@ def _calibrated(vehicle: ModelVehicle, board: Board | None = None) -> Calibrated
     least, most = time_ratio(value), time_ratio(low)
     if not least <= wanted <= most:
         raise ConfigError(
-            f"no {parameter} gives {vehicle.name!r} a ratio of {wanted:g}; possible ratios are "
-            f"{least:.3f} to {most:.3f}",
+            f"no value of {parameter} gives vehicle {vehicle.name!r} a ratio of {wanted:g}; "
+            f"possible ratios are {least:.3f} to {most:.3f}",
             key="calibration.tmr_time_ratio",
         )
     for _ in range(_STEPS):

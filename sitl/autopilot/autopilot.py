@@ -1,4 +1,4 @@
-"""The autopilot: runs the active mode, collects telemetry and decides whose commands count."""
+"""The autopilot: runs the active mode, collects telemetry and decides whose commands to obey."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Autopilot(Links):
 
     Args:
         truth: Vehicle state before the first `observe`.
-        trusted: Ids of the MAVLink systems that may send commands; empty allows all.
+        trusted: Ids of the MAVLink systems that may send commands. If empty, all systems may.
 
     Attributes:
         restart_requested: True once a client has requested a reboot, which the owner performs.
@@ -68,13 +68,13 @@ class Autopilot(Links):
     # Links.
 
     def collect(self, link: Link) -> list[Any]:
-        """Return all messages due to a link at the newest stamp: answers, then streams."""
+        """Return all messages due on a link at the newest stamp: queued answers, then streams."""
         for _ in range(min(_PARAMETERS_A_TICK, len(link.parameters_left))):
             link.send(self.parameters.message(link.parameters_left.popleft()))
         return link.take() + link.due(self.snapshot)
 
     def collect_between(self, link: Link, stamp_us: int) -> list[Any]:
-        """Return the messages of a link's fast streams at a stamp between two ticks."""
+        """Return the messages due on a link's fast streams at a stamp between two ticks."""
         tick_us, self.snapshot.stamp_us = self.snapshot.stamp_us, stamp_us
         messages = link.due(self.snapshot, between_ticks=True)
         self.snapshot.stamp_us = tick_us
@@ -89,9 +89,11 @@ class Autopilot(Links):
         takeoff_down_m: float = math.nan,
         hold: tuple[Vector, float] | None = None,
     ) -> Result:
-        """Change the mode on a user's request. Entering the current mode restarts it.
+        """Change the mode on a user's request, and return the result to acknowledge.
 
-        Height and hold are as in `Snapshot`. A disarmed vehicle takes off once it is armed.
+        Entering the current mode restarts it. None stands for an unknown mode, which is rejected. A
+        disarmed vehicle takes off once it is armed. For `takeoff_down_m` and `hold`, see
+        `Snapshot`.
         """
         result = self.commander.request_mode(mode)
         if result is Result.ACCEPTED:
@@ -101,14 +103,14 @@ class Autopilot(Links):
         return result
 
     def set_home(self, place_ned_m: Vector) -> None:
-        """Set the home position and broadcast it."""
+        """Set the home position (3,), and make its messages due on every link."""
         self.snapshot.home_ned_m = place_ned_m
         for link in self._links:
             link.hasten(dialect.MAVLINK_MSG_ID_HOME_POSITION, self.snapshot.stamp_us)
             link.hasten(dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN, self.snapshot.stamp_us)
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Change a REAL32 parameter internally and broadcast it."""
+        """Change a REAL32 parameter by its name, and broadcast the new value to all clients."""
         index = self.parameters.index(name)
         assert index is not None
         self.parameters.write(name, value, TYPE_REAL32)
@@ -117,7 +119,7 @@ class Autopilot(Links):
     # Updates over time.
 
     def observe(self, stamp_us: int, truth: Truth) -> None:
-        """Take the vehicle's state at a stamp and update the commander."""
+        """Advance to a stamp with the vehicle's state there, and update the commander."""
         now = self.snapshot
         self._texts_left = _TEXTS_A_TICK
         now.elapsed_s = (stamp_us - now.stamp_us) * 1e-6
@@ -139,7 +141,7 @@ class Autopilot(Links):
         return bool(math.hypot(north, east) < _STRAIGHT_DOWN_MPS and down > 0.0)
 
     def fly(self) -> None:
-        """Let the active mode set setpoint and motors until the next stamp."""
+        """Run the active mode: set the setpoint and the motors until the next stamp."""
         commander, now = self.commander, self.snapshot
         out = no_setpoint()
         if not commander.armed:
@@ -155,7 +157,7 @@ class Autopilot(Links):
         self.flush_texts()
 
     def flush_texts(self) -> None:
-        """Broadcast the commander's new texts."""
+        """Broadcast the commander's queued status texts, up to a limit per tick."""
         texts, self.commander.texts = self.commander.texts, []
         for severity, text in texts[: self._texts_left]:
             self._texts_left -= 1
@@ -190,11 +192,11 @@ _Sender = tuple[Link, int, int]  # link, system, component
 
 
 class _Authority:
-    """Decides whose commands and whose setpoints count.
+    """Decides whose commands and whose setpoints the vehicle obeys.
 
-    Commands count from trusted systems, or from all systems if none is listed. Setpoints count from
-    one sender at a time: the first keeps control until it has been silent for longer than OFFBOARD
-    tolerates. Warnings go to `queue_text`.
+    It obeys the commands of trusted systems, or of all systems if `trusted` is empty. It follows
+    the setpoints of one sender at a time: the first keeps control until it has been silent for
+    longer than OFFBOARD tolerates. Warnings go to `queue_text`.
     """
 
     def __init__(self, trusted: Sequence[int], queue_text: Callable[[Severity, str], None]) -> None:
@@ -217,9 +219,9 @@ class _Authority:
         return False
 
     def follows(self, message: Any, link: Link, stamp_us: int, silence_us: float) -> bool:
-        """Return True if a valid setpoint counts, and remember its sender.
+        """Return True if the vehicle should follow a valid setpoint; if so, remember its sender.
 
-        Once that sender has been silent for `silence_us`, another may take over.
+        Once that sender has been silent for longer than `silence_us`, another may take over.
         """
         sender = (link, message.get_srcSystem(), message.get_srcComponent())
         holder = self._holder

@@ -51,7 +51,7 @@ class FlightMode(Enum):
 
     @classmethod
     def from_numbers(cls, main: int, sub: int) -> FlightMode | None:
-        """Return the mode for param2 and param3 of a DO_SET_MODE; None if there is no such mode.
+        """Return the mode that param2 and param3 of DO_SET_MODE request, or None for other numbers.
 
         The sub mode is used only for AUTO. AUTO without a sub mode is LOITER.
         """
@@ -60,7 +60,7 @@ class FlightMode(Enum):
         return next((mode for mode in cls if (mode.main, mode.sub) == numbers), None)
 
     def base_mode(self, *, armed: bool) -> int:
-        """Return HEARTBEAT.base_mode as in PX4 v1.17."""
+        """Return the value of HEARTBEAT.base_mode for this mode, as PX4 v1.17 sends it."""
         flags: int = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         if armed:
             flags |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
@@ -74,7 +74,7 @@ class FlightMode(Enum):
 
 
 class Severity(IntEnum):
-    """The levels of MAV_SEVERITY that are used."""
+    """The levels of MAV_SEVERITY that the autopilot's status texts use."""
 
     EMERGENCY = 0
     CRITICAL = 2
@@ -83,7 +83,7 @@ class Severity(IntEnum):
 
 
 class Result(IntEnum):
-    """The values of MAV_RESULT that are used."""
+    """The values of MAV_RESULT with which the autopilot acknowledges commands."""
 
     ACCEPTED = 0
     TEMPORARILY_REJECTED = 1
@@ -105,7 +105,7 @@ _LANDED_STATES: dict[FlightMode, int] = {
 
 
 class Commander:
-    """State machine of mode and arming."""
+    """State machine of flight mode, arming, landing and failsafe."""
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
@@ -125,12 +125,12 @@ class Commander:
 
     @property
     def mode(self) -> FlightMode:
-        """Active mode: the failsafe's, else the user's."""
+        """Active mode: that of the failsafe if it is active, otherwise that of the user."""
         return self.failsafe or self.user_mode
 
     @property
     def armed_for_s(self) -> float:
-        """Time since arming, s; undefined while disarmed."""
+        """Time since arming, in seconds. It is meaningless while the vehicle is disarmed."""
         return (self.stamp_us - self._armed_us) * 1e-6
 
     @property
@@ -145,7 +145,7 @@ class Commander:
 
     @property
     def can_arm(self) -> bool:
-        """True if the pre-arm checks pass; the PREARM_CHECK bit of SYS_STATUS."""
+        """True if the pre-arm checks pass, as the PREARM_CHECK bit of SYS_STATUS reports."""
         return (
             self.stamp_us >= READY_US
             and not self.terminated
@@ -155,7 +155,7 @@ class Commander:
 
     @property
     def system_status(self) -> int:
-        """HEARTBEAT.system_status."""
+        """MAV_STATE of the vehicle, for HEARTBEAT.system_status."""
         if self.terminated:
             return int(dialect.MAV_STATE_FLIGHT_TERMINATION)
         if self.failsafe is not None:
@@ -166,13 +166,16 @@ class Commander:
 
     @property
     def landed_state(self) -> int:
-        """EXTENDED_SYS_STATE.landed_state."""
+        """MAV_LANDED_STATE of the vehicle, for EXTENDED_SYS_STATE.landed_state."""
         if self.landed:
             return int(dialect.MAV_LANDED_STATE_ON_GROUND)
         return int(_LANDED_STATES.get(self.mode, dialect.MAV_LANDED_STATE_IN_AIR))
 
     def is_available(self, mode: FlightMode) -> bool:
-        """Return True if the mode has its inputs: setpoints for OFFBOARD, sticks for POSCTL."""
+        """Return True if the inputs that a mode needs are arriving.
+
+        OFFBOARD needs setpoints, and POSCTL needs stick positions. MANUAL is never available.
+        """
         if mode in _INPUT_LIMITS:
             stamp_us = self._input_us.get(mode, -math.inf)
             limit_s = self._parameters.effective(_INPUT_LIMITS[mode])
@@ -180,7 +183,7 @@ class Commander:
         return mode is not FlightMode.MANUAL  # MANUAL needs radio control, which is not simulated
 
     def input_arrived(self, mode: FlightMode) -> None:
-        """Reset the watchdog of OFFBOARD or POSCTL."""
+        """Record that an input for OFFBOARD or POSCTL has arrived at the current stamp."""
         self._input_us[mode] = self.stamp_us
 
     def queue_text(self, severity: Severity, text: str) -> None:
@@ -190,7 +193,10 @@ class Commander:
     # Requests of clients.
 
     def request_mode(self, mode: FlightMode | None) -> Result:
-        """Change the user's mode. A disarmed vehicle accepts any mode."""
+        """Change the mode requested by the user, and return the result to acknowledge.
+
+        A disarmed vehicle accepts any mode. None stands for an unknown mode, which is rejected.
+        """
         if mode is None:
             return Result.TEMPORARILY_REJECTED
         if self.armed and not self.is_available(mode):
@@ -203,7 +209,7 @@ class Commander:
         return Result.ACCEPTED
 
     def request_arm(self, *, force: bool) -> Result:
-        """Arm if the checks pass or `force` is set."""
+        """Arm if the pre-arm checks pass or `force` is set. Return the result to acknowledge."""
         if self.armed:
             return Result.ACCEPTED
         if self.terminated or not (force or self.can_arm):
@@ -219,7 +225,7 @@ class Commander:
         return Result.ACCEPTED
 
     def request_disarm(self, *, force: bool) -> Result:
-        """Disarm, in the air only if `force` is set."""
+        """Disarm, but in the air only if `force` is set. Return the result to acknowledge."""
         if self.armed and not self.landed and not force:
             self.queue_text(Severity.CRITICAL, "Disarming denied: not landed")
             return Result.TEMPORARILY_REJECTED
@@ -228,7 +234,7 @@ class Commander:
         return Result.ACCEPTED
 
     def terminate(self, text: str) -> None:
-        """Stop the motors permanently."""
+        """Stop the motors permanently, and queue `text` as an emergency text for every client."""
         if not self.terminated:
             self.terminated = True
             self.queue_text(Severity.EMERGENCY, text)
@@ -236,7 +242,10 @@ class Commander:
     # Updates over time.
 
     def update(self, stamp_us: int, truth: Truth, *, wants_up: bool) -> None:
-        """Advance to a stamp. `wants_up` is True if the active setpoint climbs."""
+        """Advance to a stamp: update landing, failsafe, disarming and battery warnings.
+
+        `wants_up` is True if the active setpoint climbs.
+        """
         self.stamp_us = stamp_us
         self._detect_landing(truth, wants_up=wants_up)
         if self.armed:
@@ -321,13 +330,13 @@ _UNSET = np.full(11, math.nan)
 
 
 def no_setpoint() -> Setpoint:
-    """Return a setpoint that controls nothing."""
+    """Return a new setpoint that controls nothing: NaN in all components."""
     return _UNSET.copy()
 
 
 @dataclass(slots=True, kw_only=True)
 class Snapshot:
-    """State that guidance and telemetry read. The autopilot updates it at every tick."""
+    """State of the flight, for guidance and telemetry. The autopilot updates it at every tick."""
 
     commander: Commander
     parameters: Parameters
@@ -351,7 +360,7 @@ class Snapshot:
 
     @property
     def boot_ms(self) -> int:
-        """Boot clock, ms, with 32-bit wrap-around."""
+        """Boot clock in milliseconds, which wraps around after 32 bits."""
         return self.stamp_us // 1000 & 0xFFFFFFFF
 
     @property
@@ -360,7 +369,7 @@ class Snapshot:
         return math.degrees(self.truth.euler_rad[2]) % 360.0
 
     def geodetic_e7(self, north_m: float, east_m: float) -> tuple[int, int]:
-        """Return latitude and longitude of a local point, 1e-7 degrees."""
+        """Return the latitude and longitude of a point in the local frame, in 1e-7 degrees."""
         latitude, longitude = self.origin.geodetic(north_m, east_m)
         return round(latitude * 1e7), round(longitude * 1e7)
 
@@ -370,6 +379,9 @@ class Snapshot:
 
     @property
     def thrust(self) -> float:
-        """Mean motor command, 0..1; added one by one, as Python 3.12's `sum` rounds differently."""
+        """Mean motor command, in 0..1.
+
+        The commands are added one by one, because Python 3.12's `sum` rounds differently.
+        """
         commands = self.truth.motor_commands.tolist()
         return float(functools.reduce(operator.add, commands)) / len(commands)

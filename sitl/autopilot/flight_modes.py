@@ -36,7 +36,10 @@ Guidance = Callable[[Snapshot, Setpoint], None]
 
 
 def climbs(out: Setpoint, truth: Truth) -> bool:
-    """Return True if a setpoint climbs; NaN does not."""
+    """Return True if the position or the velocity of a setpoint requests a climb.
+
+    A component that is NaN requests nothing.
+    """
     lift = out[2] - truth.position_ned_m[2]
     return bool(out[5] < -_CLIMB_MPS or lift < -_CLIMB_M)
 
@@ -65,14 +68,17 @@ def _limit_velocity(out: Setpoint, parameters: Parameters) -> None:
 
 
 class _Anchor:
-    """A position hold that brakes first, then holds the point where the vehicle stopped."""
+    """A position hold, which brakes first and then holds the point where the vehicle stopped.
+
+    If a place is given, it holds that place without braking.
+    """
 
     def __init__(self, axes: slice, place: Vector | None = None) -> None:
         self._axes = axes
         self._place = place
 
     def hold(self, now: Snapshot, out: Setpoint) -> None:
-        """Write the position to hold, or zero velocity while braking, for the anchor's axes."""
+        """Write to `out` the position to hold, or zero velocity while braking, for these axes."""
         axes = self._axes
         if self._place is None:
             velocity = now.truth.velocity_ned_mps[axes]
@@ -178,7 +184,10 @@ def _return() -> Guidance:
 
 
 def _return_height_m(now: Snapshot) -> float:
-    """Return RTL's height above home, m: inside a cone if home is near, else RTL_RETURN_ALT."""
+    """Return the height above home, m, at which AUTO.RTL flies home.
+
+    It is RTL_RETURN_ALT, or lower inside a cone around home, but never below the vehicle.
+    """
     value = now.parameters.effective
     away = now.truth.position_ned_m - now.home_ned_m
     distance, above = math.hypot(away[0], away[1]), -float(away[2])
@@ -191,7 +200,10 @@ def _return_height_m(now: Snapshot) -> float:
 
 
 def _follow_companion(now: Snapshot, out: Setpoint) -> None:
-    """Guide OFFBOARD: follow the newest setpoint; stop along an axis without target."""
+    """Guide OFFBOARD: follow the companion's newest setpoint.
+
+    Along an axis with neither position nor velocity, the vehicle stops.
+    """
     values = now.offboard.tolist()
     for axis in range(3):
         if math.isnan(values[axis]) and math.isnan(values[3 + axis]):
@@ -201,7 +213,10 @@ def _follow_companion(now: Snapshot, out: Setpoint) -> None:
 
 
 def _follow_sticks(now: Snapshot, out: Setpoint) -> None:
-    """Guide POSCTL: sticks of -1000..1000 give the velocity; a throttle of 500 keeps the height."""
+    """Guide POSCTL: the stick positions, in -1000..1000, set velocity and yaw rate.
+
+    A throttle of 500, in 0..1000, keeps the height.
+    """
     x, y, z, r = now.sticks
     value = now.parameters.effective
     forward, right = (_stick(s) * value("MPC_VEL_MANUAL") for s in (x, y))

@@ -24,7 +24,7 @@ _TABLES = Path(__file__).with_suffix(".toml")
 
 
 class _Parameter(NamedTuple):
-    """One parameter: name of up to 16 characters, default and usable range."""
+    """One parameter of the autopilot: name of up to 16 characters, default and usable range."""
 
     name: str
     default: float | int  # the type of the default is the type of the parameter
@@ -62,7 +62,7 @@ def _parameter_table(system_id: int) -> tuple[_Parameter, ...]:
 
 
 class Parameters:
-    """Parameter values by name and by index.
+    """The autopilot's parameter values, which can be accessed by name and by index.
 
     `value` returns the stored value. `effective` returns the value for the flight code, within the
     parameter's limits, so that no stored value can cause an undefined state.
@@ -75,7 +75,7 @@ class Parameters:
         self._effective: dict[str, float] = {}  # cache, cleared at every change
 
     def restore(self, other: Parameters) -> None:
-        """Copy all values from another set with the same system id."""
+        """Copy all values from the parameters of another autopilot with the same system id."""
         self._values = list(other._values)
         self._effective.clear()
 
@@ -83,15 +83,15 @@ class Parameters:
         return len(self._table)
 
     def index(self, name: str) -> int | None:
-        """Return the index of a name; None if it is unknown."""
+        """Return the index of a parameter by its name, or None if the name is unknown."""
         return self._index.get(name)
 
     def value(self, name: str) -> float | int:
-        """Return the stored value of a known name."""
+        """Return the stored value of a parameter, whose name must be known."""
         return self._values[self._index[name]]
 
     def effective(self, name: str) -> float:
-        """Return the stored value, clamped to the parameter's limits."""
+        """Return the stored value of a parameter, clamped to its limits. The name must be known."""
         known = self._effective.get(name)
         if known is None:
             number = self._index[name]
@@ -105,7 +105,7 @@ class Parameters:
 
         An unknown name or a wrong type is ignored, as in PX4, and returns None. A value that is not
         finite is rejected (a real PX4 stores it and then hangs), and so is a change to a read-only
-        parameter.
+        parameter. A rejected or unchanged value returns False.
         """
         number = self._index.get(name)
         if number is None or wire_type != self._table[number].wire_type:
@@ -121,12 +121,12 @@ class Parameters:
         return True
 
     def message(self, index: int) -> Any:
-        """Return the PARAM_VALUE for a valid index."""
+        """Return the PARAM_VALUE message of the parameter with a valid index."""
         row = self._table[index]
         return self._message(row.name, row.packed(self._values[index]), row.wire_type, index)
 
     def hash_message(self) -> Any:
-        """Return the PARAM_VALUE with the hash that a client uses to validate its cache."""
+        """Return the PARAM_VALUE message with the hash by which a client validates its cache."""
         digest = 0
         for row, value in zip(self._table, self._values, strict=True):
             digest = zlib.crc32(row.name.encode() + row.packed(value), digest)

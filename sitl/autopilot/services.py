@@ -79,7 +79,7 @@ def _whole(value: float) -> int | None:
 
 
 def _horizontal(autopilot: Autopilot, message: Any) -> tuple[float, float] | None:
-    """Return the local north and east of a command's position, m; None if it gives no position."""
+    """Return the local north and east, m, of a command's position, or None if it gives none."""
     if message.get_type() == "COMMAND_LONG":
         latitude, longitude = message.param5, message.param6
     elif _INT_UNSET in (message.x, message.y):
@@ -92,7 +92,7 @@ def _horizontal(autopilot: Autopilot, message: Any) -> tuple[float, float] | Non
 
 
 def _down(autopilot: Autopilot, message: Any) -> float:
-    """Return a command's height as local down, m; NaN if it has none."""
+    """Return a command's height as a local down coordinate, m, or NaN if it gives no height."""
     now, is_long = autopilot.snapshot, message.get_type() == "COMMAND_LONG"
     altitude_m = float(message.param7 if is_long else message.z)
     if not abs(altitude_m) < _FARTHEST_M:
@@ -112,7 +112,10 @@ def _arm_disarm(autopilot: Autopilot, message: Any, _link: Link) -> Result | Non
 
 
 def _set_mode(autopilot: Autopilot, message: Any, link: Link) -> Result:
-    """Answer twice like PX4: its receiver acknowledges first, then its commander decides."""
+    """Handle DO_SET_MODE, and acknowledge it twice.
+
+    As in PX4, the receiver accepts the command first, and then the commander decides.
+    """
     link.send(_acknowledge(message, dialect.MAV_CMD_DO_SET_MODE, Result.ACCEPTED))
     base, main, sub = map(_whole, (message.param1, message.param2, message.param3))
     if base is None or not base & 1 or main is None:
@@ -181,7 +184,10 @@ def _request_message(autopilot: Autopilot, message: Any, link: Link) -> Result:
 
 
 def _send(autopilot: Autopilot, link: Link, number: int, *, index: int = 0) -> Result:
-    """Send a requested message, or the messages that `index` selects."""
+    """Send a requested message, or the messages that `index` selects.
+
+    Return ACCEPTED, or DENIED if there is no such message to send.
+    """
     if number in DESCRIPTIONS:
         messages = DESCRIPTIONS[number](autopilot.snapshot, index)
     else:
@@ -211,7 +217,7 @@ def _get_interval(_autopilot: Autopilot, message: Any, link: Link) -> Result:
 
 
 def _reboot(autopilot: Autopilot, message: Any, link: Link) -> Result:
-    """Restart the simulation at its start, if the vehicle is disarmed or terminated."""
+    """Request a restart of the simulation, if the vehicle is disarmed or terminated."""
     if _whole(message.param1) != 1 or link.in_lockstep:
         return Result.UNSUPPORTED
     if autopilot.snapshot.stamp_us < GPS_FIX_US:
@@ -268,10 +274,11 @@ def _position_target(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def setpoint_of(message: Any, heading_rad: float, origin: Origin, home_down_m: float) -> Setpoint:
-    """Return the setpoint of a SET_POSITION_TARGET message.
+    """Return the setpoint (11,), in NED, that a SET_POSITION_TARGET message gives.
 
-    A BODY_NED setpoint is rotated by the heading (rad, from north). A global setpoint's altitude is
-    above sea level or home. Raises ValueError if frame or type mask is not supported.
+    A BODY_NED setpoint is rotated by the heading (rad, from north). The altitude of a global
+    setpoint is above sea level or above home, depending on the frame. Raises ValueError if frame or
+    type mask is not supported.
     """
     frame, mask = message.coordinate_frame, message.type_mask
     is_local = message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
@@ -312,14 +319,17 @@ def _check_mask(mask: int) -> None:
 def _fill(
     out: Setpoint, start: int, values: tuple[float, float, float], ignored: int, limit: float
 ) -> None:
-    """Write the components that the mask does not ignore, except NaN and huge values."""
+    """Write to `out`, from index `start`, the values that the mask `ignored` does not ignore.
+
+    NaN and values beyond `limit` are omitted.
+    """
     for axis, value in enumerate(values):
         if not ignored >> axis & 1 and abs(value) <= limit:
             out[start + axis] = value
 
 
 def _turn(out: Setpoint, heading_rad: float) -> None:
-    """Rotate velocity and acceleration from forward-right to north-east."""
+    """Rotate a setpoint's velocity and acceleration from forward-right to north-east, in place."""
     cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
     for start in (3, 6):
         if not np.isnan(out[start : start + 2]).all():
@@ -355,7 +365,10 @@ def _param_request_list(autopilot: Autopilot, _message: Any, link: Link) -> None
 
 
 def _param_request_read(autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Send one parameter by index, or by name if the index is -1; no answer if unknown."""
+    """Send one parameter by its index, or by its name if the index is -1.
+
+    A request for an unknown parameter is not answered.
+    """
     store, index = autopilot.parameters, message.param_index
     if index < 0 and message.param_id == HASH_NAME:
         link.send(store.hash_message())
@@ -391,7 +404,7 @@ def _mission_ack(_autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _file_transfer(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Answer with a NAK, because there are no files and the client would retry."""
+    """Answer with a NAK: the autopilot has no files, and without an answer the client retries."""
     sequence, session, opcode = struct.unpack_from("<HBB", bytes(message.payload))
     head = (sequence + 1) & 0xFFFF, session, _FTP_NAK, 1, opcode, 0, 0, _FTP_FILE_NOT_FOUND
     reply = struct.pack("<HBBBBBxIB", *head).ljust(251, b"\0")
@@ -399,7 +412,7 @@ def _file_transfer(_autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _timesync(autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Answer a request (tc1 = 0) with the boot clock, ns."""
+    """Answer a TIMESYNC request (tc1 = 0) with the boot clock in nanoseconds."""
     if message.tc1 == 0:
         now_ns = max(autopilot.snapshot.stamp_us * 1000, 1)
         link.send(dialect.MAVLink_timesync_message(now_ns, message.ts1))
@@ -464,7 +477,7 @@ def handle(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _is_addressed(message: Any, system: int) -> bool:
-    """Return True if a message is addressed to the autopilot of `system`, or to all."""
+    """Return True if a message is addressed to the autopilot of `system`, or broadcast."""
     if not hasattr(message, "target_component"):  # SET_MODE, MANUAL_CONTROL
         return getattr(message, "target_system", None) == system
     return message.target_system in (system, 0) and message.target_component in (COMPONENT, 0)

@@ -30,7 +30,7 @@ _UNIX_EPOCH_S = 1_750_000_000  # Unix time of boot; fixed, so that runs are repe
 
 
 def _clip(value: float, low: int, high: int) -> int:
-    """Return the nearest integer within the limits; 0 for NaN."""
+    """Return the integer within the limits that is nearest to a value, or 0 if it is NaN."""
     return 0 if math.isnan(value) else round(min(max(value, low), high))
 
 
@@ -39,12 +39,12 @@ def _int16(value: float) -> int:
 
 
 def _uint16(value: float) -> int:
-    """Clip a value for a uint16 field in which 65535 means unknown."""
+    """Round a value and clip it for a uint16 field in which 65535 means unknown."""
     return _clip(value, 0, 65534)
 
 
 def int32(value: float) -> int:
-    """Clip a value for an int32 field."""
+    """Round a value and clip it for an int32 field. NaN becomes 0."""
     return _clip(value, -(2**31), 2**31 - 1)
 
 
@@ -94,7 +94,7 @@ def _sys_status(s: Snapshot) -> Any:
 
 
 def _gps_raw_int(s: Snapshot) -> Any:
-    """Return GPS_RAW_INT: no fix at first, then a good one."""
+    """Return GPS_RAW_INT: without a fix shortly after boot, then with a good fix."""
     if not s.commander.has_gps_fix:
         return dialect.MAVLink_gps_raw_int_message(s.stamp_us, 0, 0, 0, 0, 9999, 9999, 0, 0, 0)
     north, east, down = s.truth.position_ned_m.tolist()
@@ -297,7 +297,10 @@ def _flight_information(now: Snapshot, _index: int) -> list[Any]:
 
 
 def _available_modes(_now: Snapshot, index: int) -> list[Any]:
-    """Return AVAILABLE_MODES for one mode, counted from 1, or for all if the index is 0."""
+    """Return the AVAILABLE_MODES message of the mode with an index, counted from 1.
+
+    An index of 0 selects the messages of all modes.
+    """
     modes = list(FlightMode)
     return [
         AvailableModes(
@@ -316,14 +319,17 @@ DESCRIPTIONS: Mapping[int, Callable[[Snapshot, int], list[Any]]] = {
     ComponentMetadata.id: lambda now, _index: [ComponentMetadata(now.boot_ms, 0, b"")],
     AvailableModes.id: _available_modes,
 }
-"""Builders by message id; the second argument is param2 of the request."""
+"""Builders of the messages that describe the autopilot, by message id.
+
+The second argument of a builder is param2 of the request.
+"""
 
 
 # Streams ------------------------------------------------------------------------------------------
 
 
 class Preset(Enum):
-    """Set of default rates of a link, in `streams.toml`."""
+    """Name of a set of default stream rates for a link. `streams.toml` has the rates."""
 
     ONBOARD = "onboard"  # PX4 v1.17's link to a companion
     GCS = "gcs"  # PX4 v1.17's link to a ground station
@@ -356,7 +362,7 @@ class Link:
         self._choose_active()
 
     def send(self, message: Any) -> None:
-        """Queue a message for this client."""
+        """Queue a message for this client. If the queue is full, drop the oldest message."""
         if len(self.outbox) >= _OUTBOX:
             del self.outbox[0]
         self.outbox.append(message)
@@ -367,12 +373,19 @@ class Link:
         return messages
 
     def interval_us(self, message_id: int) -> int | None:
-        """Return the interval of a message; 0 if it is not streamed, None if unknown."""
+        """Return the interval, us, at which a message is streamed.
+
+        It is 0 if the message is not streamed, and None if its id is unknown.
+        """
         stream = self._streams.get(message_id)
         return None if stream is None else stream.interval_us
 
     def set_interval(self, message_id: int, interval_us: float, stamp_us: int) -> bool:
-        """Set an interval: negative stops, 0 restores the default. Return False if unknown."""
+        """Set the interval, us, at which a message is streamed. Return False if its id is unknown.
+
+        A negative interval stops the stream, and 0 restores the preset's default. Other intervals
+        are clipped to the range that the link supports.
+        """
         stream = self._streams.get(message_id)
         if stream is None:
             return False
@@ -386,7 +399,7 @@ class Link:
         return True
 
     def hasten(self, message_id: int, stamp_us: int) -> None:
-        """Make a streamed message due now, because its contents have changed."""
+        """Make a streamed message due at a stamp, because its contents have changed."""
         self._streams[message_id].due_us = stamp_us
 
     @property
@@ -395,9 +408,10 @@ class Link:
         return bool(self._fast)
 
     def due(self, snapshot: Snapshot, *, between_ticks: bool = False) -> list[Any]:
-        """Return the messages due now; with `between_ticks`, only those of the fast streams.
+        """Return the messages of all streams that are due at the snapshot's stamp.
 
-        A late stream skips the messages that it missed.
+        With `between_ticks`, return only those of the fast streams. A late stream skips the
+        messages that it missed.
         """
         stamp_us, messages = snapshot.stamp_us, []
         for stream in self._fast if between_ticks else self._active:
@@ -427,12 +441,12 @@ class Links:
         self._links: list[Link] = []
 
     def open_link(self, preset: Preset) -> Link:
-        """Add a client with the streams of a preset."""
+        """Add a client, and return its link with the streams of a preset."""
         self._links.append(Link(preset))
         return self._links[-1]
 
     def close_link(self, link: Link) -> None:
-        """Remove a client."""
+        """Remove the link of a client."""
         self._links.remove(link)
 
     def broadcast(self, message: Any) -> None:

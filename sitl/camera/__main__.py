@@ -114,7 +114,7 @@ def _camera(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command. Return its exit code."""
+    """Run `python -m sitl.camera`. Return its exit code."""
     prog_name = "python -m sitl.camera"
     return exit_code(
         lambda: _camera.main(args=arguments, prog_name=prog_name, standalone_mode=False)

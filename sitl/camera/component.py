@@ -49,9 +49,9 @@ _PIXEL_PITCH_MM = 0.01  # arbitrary: field of view = 2 atan(sensor / 2 / focal l
 
 @dataclass(slots=True)
 class _Schedule:
-    """A schedule that is due at the first poll, and then every `interval_s` in phase with it.
+    """A periodic schedule, which is due at the first poll and then every `interval_s` after it.
 
-    A late poll does not shift the phase. Missed times are skipped.
+    A late poll does not delay later times. Missed times are skipped.
     """
 
     interval_s: float
@@ -59,7 +59,7 @@ class _Schedule:
     _count: int = 0
 
     def due(self, stamp_s: float) -> bool:
-        """Return True if it is due at a stamp, and advance to the next time."""
+        """Return True if the schedule is due at a stamp; if so, advance it to the next time."""
         if self._first_s is None:
             self._first_s = stamp_s
         elapsed_s = stamp_s - self._first_s + _SLACK_S
@@ -69,20 +69,20 @@ class _Schedule:
         return True
 
     def restart(self) -> None:
-        """Make it due at the next poll, with a new phase."""
+        """Make the schedule due at the next poll, and count the interval from that poll."""
         self._first_s, self._count = None, 0
 
 
 class Camera:
-    """A depth camera on a vehicle in a world.
+    """Simulates a depth camera on a vehicle in a world, as a MAVLink camera component.
 
     Args:
-        world_boxes: (n, 6) xmin ymin zmin xmax ymax zmax, ENU m.
+        world_boxes: Boxes (n, 6) xmin ymin zmin xmax ymax zmax, ENU m.
         mount_offset_flu_m: Offset of the optical centre from the vehicle's position.
         rate_hz: Default frame rate, at most 50 Hz.
-        heartbeat_hz: Heartbeats per second; 0 for none.
+        heartbeat_hz: Heartbeats per second. 0 turns them off.
         system: MAVLink system id of the vehicle. Commands for other systems are ignored.
-        depth: Stream that gets frames at the default rate while it has readers; None for no stream.
+        depth: Stream that gets frames at the default rate while it has readers, or None.
 
     Raises ConfigError if the size, field of view or rate is invalid.
     """
@@ -128,7 +128,11 @@ class Camera:
         self._sensors: dict[int, _Schedule] = {}  # those requested by a client, by message id
 
     def handle(self, message: Message) -> list[Message]:
-        """Return the answers to a message; none if it is not a command for this camera."""
+        """Handle a message, and return the answers to it.
+
+        The list is empty if the message is not a command for this camera, or is a command for all
+        components that the camera refuses.
+        """
         kind = message.get_type()
         if kind not in ("COMMAND_LONG", "COMMAND_INT") or message.target_system != self.system:
             return []
@@ -142,7 +146,9 @@ class Camera:
     def poll(
         self, stamp_s: float, position_enu_m: Vector, quaternion_flu_enu: Vector
     ) -> list[Message]:
-        """Return the messages due at a stamp: a heartbeat, a frame and ranges for the pose.
+        """Return the messages due at a stamp: a heartbeat, and a frame and ranges seen from a pose.
+
+        A frame that is due on the depth stream is sent there.
 
         Args:
             stamp_s: Boot clock of the vehicle, s. A step back by more than 1 s is a reboot.
@@ -174,7 +180,7 @@ class Camera:
         return due
 
     def idle(self) -> list[Message]:
-        """Return the messages to send while there is no pose: a heartbeat, if heartbeats are on."""
+        """Return the messages to send while no pose is known: a heartbeat, unless they are off."""
         if self._heartbeat is None:
             return []
         kind, no_autopilot = dialect.MAV_TYPE_CAMERA, dialect.MAV_AUTOPILOT_INVALID
@@ -277,7 +283,10 @@ class Camera:
         return int(dialect.MAV_RESULT_ACCEPTED if accepted else dialect.MAV_RESULT_DENIED)
 
     def _set_interval(self, message: Message) -> bool:
-        """Send a range sensor's messages every param2 microseconds; 0: 10 Hz, -1: never."""
+        """Send a range sensor's messages every param2 microseconds (0: at 10 Hz, -1: never).
+
+        Return False if the message id or the interval is invalid.
+        """
         number, interval_us = _whole(message.param1), float(message.param2)
         if number not in SENSORS or not (0.0 <= interval_us < math.inf or interval_us == -1.0):
             return False
@@ -288,7 +297,10 @@ class Camera:
         return True
 
     def _start_capture(self, message: Message) -> bool:
-        """Start to capture param3 frames (0: unlimited) every param2 seconds (0: default)."""
+        """Start to capture param3 frames (0: unlimited), one every param2 seconds (0: default).
+
+        Return False if a parameter is invalid.
+        """
         interval_s, count = float(message.param2), _whole(message.param3)
         if count is None or count < 0 or interval_s < 0.0 or math.isinf(interval_s):
             return False
@@ -301,7 +313,10 @@ class Camera:
 
 
 def _whole(value: float) -> int | None:
-    """Return an integer sent in a float parameter; 0 for NaN, None beyond 32 bits."""
+    """Return the integer that a command's float parameter contains.
+
+    NaN counts as 0. The result is None if the integer does not fit into 32 bits.
+    """
     if math.isnan(value):
         return 0
     return round(value) if abs(value) < 2**31 else None

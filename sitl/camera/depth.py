@@ -47,7 +47,9 @@ def render_depth(
     rows: int,
     hfov_rad: float,
 ) -> Image:
-    """Render a depth image (rows, columns), uint8, 0.1 m per level, 255 if nothing is in range.
+    """Render the depth image seen from a pose, as a uint8 array of shape (rows, columns).
+
+    A grey level is 0.1 m of depth, and 255 means that nothing is in range.
 
     Args:
         boxes_enu_m: Boxes (n, 6) xmin ymin zmin xmax ymax zmax. The ground z = 0 always exists.
@@ -136,10 +138,11 @@ def _touches(box: Vector, position: Vector) -> bool:
 def _window(
     corners: Vector, focal_px: float, shape: tuple[int, int], window: NDArray[np.int64]
 ) -> None:
-    """Write the rows and columns (first, end, first, end) that can see the box, plus 1 px around.
+    """Write to `window` the first row, end row, first column and end column that can see a box.
 
-    The part of the box beyond the near plane is convex. Its vertices are the corners beyond that
-    plane and the points where edges cross it, so their projections bound it.
+    They include a margin of 1 pixel. The part of the box beyond the near plane is convex. Its
+    vertices are the corners beyond that plane and the points where edges cross it, so their
+    projections bound it.
     """
     rows, columns = shape
     top, bottom, first, last = math.inf, -math.inf, math.inf, -math.inf

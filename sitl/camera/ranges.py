@@ -33,10 +33,10 @@ _RIGHT_ANGLE = math.pi / 2.0
 
 
 def _sector_ranges_cm(boxes_enu_m: Vector, position_enu_m: Vector, yaw_rad: float) -> list[int]:
-    """Return the ranges in the horizontal plane, cm, of 72 sectors of 5 degrees.
+    """Return the range, cm, to the nearest obstacle in each of 72 horizontal sectors of 5 degrees.
 
-    The first sector is centred on the vehicle's nose, and the others follow clockwise. 2501 means
-    that there is nothing within 25 m.
+    The first sector is centred on the vehicle's nose, and the others follow clockwise. A range of
+    2501 means that the sector is free for 25 m.
 
     Args:
         boxes_enu_m: Boxes (n, 6) xmin ymin zmin xmax ymax zmax.
@@ -56,7 +56,10 @@ def _sector_ranges_cm(boxes_enu_m: Vector, position_enu_m: Vector, yaw_rad: floa
 def _ring(
     boxes_enu_m: Vector, stamp_s: float, position: Vector, quaternion: Vector
 ) -> list[Message]:
-    """Return an OBSTACLE_DISTANCE message for a pose (ENU m; FLU to ENU) at a boot-clock stamp."""
+    """Return one OBSTACLE_DISTANCE message, with the ranges around the vehicle.
+
+    `stamp_s` is the boot clock, `position` is in ENU m, and `quaternion` rotates FLU to ENU.
+    """
     yaw_rad = yaw_from_quaternion(quaternion)
     return [
         dialect.MAVLink_obstacle_distance_message(
@@ -70,7 +73,10 @@ def _ring(
 def _beams(
     boxes_enu_m: Vector, stamp_s: float, position: Vector, quaternion: Vector
 ) -> list[Message]:
-    """Return two DISTANCE_SENSOR messages, forward (id 0) and down (id 1); arguments as `_ring`."""
+    """Return two DISTANCE_SENSOR messages: forward (id 0) and down (id 1).
+
+    The arguments are those of `_ring`.
+    """
     yaw_rad = yaw_from_quaternion(quaternion)
     messages = []
     for number, (orientation, pitch_rad) in enumerate(((_FORWARD, 0.0), (_DOWN, _RIGHT_ANGLE))):
@@ -90,4 +96,7 @@ SENSORS: dict[int, Callable[[Vector, float, Vector, Vector], list[Message]]] = {
     dialect.MAVLINK_MSG_ID_OBSTACLE_DISTANCE: _ring,
     dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR: _beams,
 }
-"""Builders of sensor messages from boxes, stamp, position and attitude, by message id."""
+"""Functions that build a range sensor's messages, keyed by message id.
+
+Their arguments are boxes, stamp, position and attitude.
+"""

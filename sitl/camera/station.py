@@ -97,7 +97,7 @@ _REQUESTS = (  # component, command, confirmation and message id
 
 
 class PoseTracker:
-    """Combines attitude and local position, which have different stamps.
+    """Combines an autopilot's attitude and position messages, whose stamps differ, into poses.
 
     Every new attitude gives a pose. The newest position is extrapolated to the attitude's stamp
     with the velocity, for 0.5 s at most, so that a slow position stream does not blur frames.
@@ -111,16 +111,19 @@ class PoseTracker:
 
     @property
     def has_position(self) -> bool:
-        """True once LOCAL_POSITION_NED has arrived."""
+        """True once a LOCAL_POSITION_NED message has arrived since the autopilot's last reboot."""
         return self._position is not None
 
     @property
     def attitude_stamp_s(self) -> float | None:
-        """Autopilot's time of the newest attitude, s; None before the first."""
+        """Stamp of the newest attitude on the autopilot's clock, s, or None before the first."""
         return None if self._attitude is None else self._attitude[0]
 
     def take(self, message: Any) -> bool:
-        """Handle a message. Return True if there is a new pose. Impossible values are ignored."""
+        """Handle a message of the autopilot. Return True if it gives a new pose.
+
+        Impossible values are ignored.
+        """
         kind = message.get_type()
         if kind == "LOCAL_POSITION_NED":
             position = np.array([message.x, message.y, message.z], dtype=np.float64)
@@ -152,12 +155,14 @@ class PoseTracker:
         return quaternion / length if 0.5 < length < math.inf else None
 
     def pose(self) -> tuple[float, Vector, Vector, Vector]:
-        """Return stamp, s, position (3,) in the world, attitude (4,) FLU to ENU, and velocity (3,).
+        """Return the stamp, the position, the attitude and the velocity of the newest pose.
 
-        Raises LookupError if there is no pose yet.
+        The stamp is in seconds on the autopilot's clock. The position (3,) is in world ENU m, the
+        attitude (4,) is a quaternion from FLU to ENU, and the velocity (3,) is in ENU m/s. Raises
+        LookupError if attitude and position have not both arrived yet.
         """
         if self._position is None or self._attitude is None:
-            raise LookupError("no pose yet")
+            raise LookupError("cannot give a pose before both attitude and position have arrived")
         stamp_s, quaternion = self._attitude
         since_s, position, velocity = self._position
         ahead_s = max(0.0, min(stamp_s - since_s, _LONGEST_EXTRAPOLATION_S))
@@ -166,7 +171,7 @@ class PoseTracker:
 
 
 class Witness:
-    """Derives collision, clearance and energy of a foreign vehicle from its pose.
+    """Derives collision, clearance and energy of a foreign autopilot's vehicle from its poses.
 
     The record begins when the vehicle arms. The energy comes from the regression; the power of the
     propellers is unknown. The profile's body box and regression stand in for the vehicle's own.
@@ -189,7 +194,7 @@ class Witness:
         self._energy_j = 0.0
 
     def take(self, message: Any) -> None:
-        """Handle a message of the autopilot."""
+        """Take arming, mode and landed state from a message of the autopilot."""
         if isinstance(message, dialect.MAVLink_heartbeat_message):
             armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
             if armed and not self._armed:
@@ -201,7 +206,10 @@ class Witness:
     def observe(
         self, stamp_s: float, position_enu_m: Vector, quaternion_flu_enu: Vector, velocity: Vector
     ) -> Collision | None:
-        """Judge a pose at a boot-clock stamp, s. Return the collision when the first one occurs."""
+        """Judge a pose at a boot-clock stamp, in seconds.
+
+        Return the first collision of the flight in the call that detects it, otherwise None.
+        """
         if self._stamp_s is not None and stamp_s <= self._stamp_s:
             if stamp_s > self._stamp_s - 1.0:
                 return None
@@ -228,13 +236,16 @@ class Witness:
         return float(regression_power(velocity, acceleration, self._coefficients))
 
     def save(self, folder: Path) -> None:
-        """Write the referee's log and verdict, if there was a pose. Raises RecordError."""
+        """Write the referee's log and verdict to a folder, but nothing if no pose was judged.
+
+        Raises RecordError if a file cannot be written.
+        """
         if self._stamp_s is not None:
             self._referee.save(folder, {"regression": self._energy_j})
 
 
 class Station:
-    """Camera, referee and links of one autopilot.
+    """Runs the depth camera, the referee and the links of one autopilot.
 
     It connects the peers of several endpoints, and is the camera component among them. Two
     autopilots with the same system id at one endpoint would look like one vehicle that jumps, so
@@ -242,10 +253,10 @@ class Station:
     their signatures.
 
     Args:
-        urls: Endpoints to open. One that cannot be opened raises LinkError.
-        witness: Judges the poses; None without a referee.
-        origin_given: The tracker's origin is final. Otherwise the camera of a simulated vehicle on
-            the link may replace it.
+        urls: Endpoints to open. LinkError is raised if one of them cannot be opened.
+        witness: Referee of the poses, or None for no referee.
+        origin_given: Whether the tracker's origin is final. If not, the camera of a simulated
+            vehicle on the link may replace it.
         clock: Monotonic clock in seconds for repeated requests, never for frames.
     """
 
@@ -290,7 +301,10 @@ class Station:
             self.serve()
 
     def serve(self) -> None:
-        """Handle waiting messages for a bounded time, then send the messages that are due."""
+        """Handle waiting messages for a bounded time, then send the messages that are due.
+
+        Raises LinkLost if the peer of a link closed it.
+        """
         self.peers.serve(self._clock() + _TURN_S)
         if self.peers.lost is not None:
             raise self.peers.lost
@@ -299,7 +313,10 @@ class Station:
         self._request()
 
     def receive(self, message: Any, source: _Linked) -> None:
-        """Handle a message from a peer, and forward it."""
+        """Handle a message from a peer, and forward it to the other peers if they need it.
+
+        The messages of a second autopilot with the same system id are dropped.
+        """
         if self._is_of_holder(message, source) and self.take(message):
             frame = bytes(message.get_msgbuf())
             self.peers.send_in_turn(partial(_Linked.forward, frame=frame, sender=source))
@@ -347,7 +364,7 @@ class Station:
         return not for_camera
 
     def _hold(self, command: Any) -> None:
-        """Keep a command until the camera has its origin."""
+        """Keep a command until the camera has its origin, and answer that it is in progress."""
         sender, number = (command.get_srcSystem(), command.get_srcComponent()), command.command
         if len(self._held) < _MOST_HELD or (*sender, number) in self._held:
             self._held[*sender, number] = command
@@ -355,7 +372,7 @@ class Station:
             self._send([dialect.MAVLink_command_ack_message(number, progress, 0, 0, *sender)])
 
     def _look(self) -> None:
-        """Send the messages due at the newest pose, and let the referee judge it."""
+        """Send the camera's messages due at the newest pose, and let the referee judge the pose."""
         pose = self._tracker.pose()
         self._send(self.camera.poll(*pose[:3]))
         collision = None if self._witness is None else self._witness.observe(*pose)
@@ -382,7 +399,7 @@ class Station:
             self._send(self.camera.idle())
 
     def _place(self) -> None:
-        """Use the given origin if no camera has sent a better one within a second.
+        """Use the tracker's origin if no simulated camera has sent another within a second.
 
         The second is measured by the autopilot's clock, which may run much faster than real time.
         """

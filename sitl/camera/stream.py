@@ -61,13 +61,13 @@ class DepthStream:
     def opened(
         path: Path | None, size: tuple[int, int]
     ) -> contextlib.AbstractContextManager[DepthStream | None]:
-        """Return a context manager with an open stream, or with None if there is no path."""
+        """Return a context manager that gives an open stream, or None if `path` is None."""
         if path is None:
             return contextlib.nullcontext()
         return contextlib.closing(DepthStream(path, size))
 
     def serve(self) -> bool:
-        """Accept readers, and send the rest of queued frames. Return True if there are readers."""
+        """Accept new readers, and go on sending queued frames. Return True if readers remain."""
         self._readers += self._listener.accept_ready()
         self._send(b"")
         return bool(self._readers)
@@ -80,7 +80,9 @@ class DepthStream:
         quaternion_flu_enu: Vector,
         hfov_rad: float,
     ) -> None:
-        """Send a frame to every reader. It replaces a frame that waits to be sent to a slow reader.
+        """Send a frame to every reader.
+
+        For a slow reader, the frame replaces a frame that still waits to be sent.
 
         Args:
             pixels: Image (rows, columns) of `render_depth`.
@@ -106,7 +108,7 @@ class DepthStream:
                 self._readers.remove(reader)
 
     def close(self) -> None:
-        """Close and remove the socket."""
+        """Disconnect all readers, and close and remove the socket."""
         for reader in self._readers:
             reader.close()
         self._listener.close()

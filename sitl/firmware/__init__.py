@@ -1,1 +1,1 @@
-"""Real firmware flies the simulated vehicle: PX4 or ArduPilot, over its own simulator link."""
+"""Lets PX4 or ArduPilot fly the simulated vehicle, over the firmware's own simulator link."""

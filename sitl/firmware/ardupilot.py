@@ -36,9 +36,9 @@ _FULL_SHARE = 0.5  # share of the rotors' torque that its mixer gives at full co
 
 
 class ArduPilotLink:
-    """One ArduPilot whose JSON backend sends to our UDP port; port 0 selects any free one.
+    """The link to one ArduPilot, whose JSON backend sends its outputs to our UDP port.
 
-    Raises LinkError if the port cannot be opened.
+    Port 0 selects any free port. Raises LinkError if the port cannot be opened.
     """
 
     step_s = 0.0025  # ArduCopter's main loop runs at 400 Hz
@@ -59,12 +59,18 @@ class ArduPilotLink:
 
     @classmethod
     def open(cls, sensors: Sensors, *, ours: bool) -> ArduPilotLink:
-        """Open ArduPilot's port, or any port if we start ArduPilot. Raises LinkError."""
+        """Open a free UDP port if we start ArduPilot (`ours`), otherwise ArduPilot's usual port.
+
+        Raises LinkError if the port cannot be opened.
+        """
         return cls(sensors, 0 if ours else PORT)
 
     @staticmethod
     def parameters(profile: VehicleProfile) -> dict[str, float]:
-        """Return ArduCopter's parameters for a vehicle: frame, thrust curve and rate loops."""
+        """Return the ArduCopter parameters that a vehicle needs, keyed by name.
+
+        They set the frame, the thrust curve and the rate loops.
+        """
         loops = RateLoops.of(profile)
         return {
             **FIXED_PARAMETERS["ardupilot"],
@@ -74,7 +80,10 @@ class ArduPilotLink:
         }
 
     def start(self, binary: Path, boot: Boot) -> FirmwareProcess:
-        """Start ArduCopter's SITL binary, which connects to this link. See `Px4Link.start`."""
+        """Start ArduCopter's SITL binary, which then connects to this link.
+
+        Raises VehicleProcessError if it cannot be started.
+        """
         program, origin = FirmwareProcess.program(binary), Origin()
         scratch = ScratchFolder("ardupilot")
         lines = [f"{name} {value:.6g}\n" for name, value in self.parameters(boot.profile).items()]
@@ -93,15 +102,15 @@ class ArduPilotLink:
 
     @property
     def port(self) -> int:
-        """Port that ArduPilot sends to."""
+        """UDP port to which ArduPilot sends its outputs."""
         return int(self._socket.getsockname()[1])
 
     def has_called(self, timeout_s: float) -> bool:
-        """Return True once ArduPilot has sent its outputs, waiting at most `timeout_s`."""
+        """Return True if ArduPilot has sent outputs, after waiting at most `timeout_s` for them."""
         return self._peer is not None or self._await_servos(timeout_s)
 
     def exchange(self, stamp_us: int, truth: Truth) -> Vector:
-        """Send the state of a step and return the motor outputs (4,) in 0..1.
+        """Send the vehicle's state after a physics step. Return the next motor outputs (4,), 0..1.
 
         Raises VehicleProcessError if ArduPilot has stopped answering.
         """
@@ -115,9 +124,10 @@ class ArduPilotLink:
         self._socket.close()
 
     def _await_servos(self, limit_s: float) -> bool:
-        """Wait for the outputs of the next frame, skipping repeated ones. Return True if received.
+        """Wait at most `limit_s` for ArduPilot's outputs of a new frame. Return True if received.
 
-        ArduPilot repeats the outputs of a frame that was not answered.
+        ArduPilot repeats the outputs of a frame that was not answered. Repeated outputs are
+        skipped.
         """
         deadline_s = time.monotonic() + limit_s
         while (remaining_s := deadline_s - time.monotonic()) > 0.0:

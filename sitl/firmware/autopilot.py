@@ -49,7 +49,7 @@ def follows_companion(heartbeat: Any) -> bool:
 
 
 class FirmwareAutopilot(Links):
-    """Firmware at the other end of a MAVLink link, as the autopilot of a simulation.
+    """Makes real firmware at the other end of a MAVLink link the autopilot of a simulation.
 
     It requests the streams that a flight needs, and sets the firmware's local origin to the
     world's, so that the firmware reports world coordinates. Clients of any preset get all of the
@@ -80,18 +80,21 @@ class FirmwareAutopilot(Links):
     # Clients.
 
     def handle(self, message: Any, _link: Link) -> None:
-        """Queue a client's message for the next `deliver`, with the client's own ids."""
+        """Queue a client's message for the firmware, with the client's own MAVLink ids.
+
+        The next `deliver` sends it.
+        """
         codec = self._codec
         codec.system, codec.component = message.get_srcSystem(), message.get_srcComponent()
         self._to_firmware.append(codec.encode(message))
         codec.system, codec.component = self.system_id, CAMERA
 
     def collect(self, link: Link) -> list[Any]:
-        """Return the messages for a client since the last call."""
+        """Return the messages that were queued for a client since the last call."""
         return link.take()
 
     def forget(self) -> None:
-        """Drop the messages that no client has collected."""
+        """Discard all messages that the clients have not collected."""
         for link in self._links:
             link.outbox.clear()
 
@@ -104,20 +107,24 @@ class FirmwareAutopilot(Links):
 
     @property
     def commander(self) -> FirmwareAutopilot:
-        """This object, which has the motors' state: `armed` and `terminated`."""
+        """This object itself, because it also holds the motors' state: `armed` and `terminated`."""
         return self
 
     @property
     def may_touch_ground(self) -> bool:
-        """True unless the firmware follows a companion."""
+        """True if a gentle ground contact counts as a landing.
+
+        It does unless the firmware follows a companion.
+        """
         return not self._follows
 
     # The firmware.
 
     def deliver(self) -> None:
-        """Send the clients' messages. If the firmware echoes, wait until it has read them.
+        """Send the clients' queued messages to the firmware.
 
-        The wait takes 0.2 s at most. Raises VehicleProcessError if the firmware closed its link.
+        If the firmware echoes, wait for at most 0.2 s until it has read them. Raises
+        VehicleProcessError if the firmware has closed its link.
         """
         if not self._to_firmware:
             return
@@ -131,15 +138,18 @@ class FirmwareAutopilot(Links):
             self._receive(_ECHO_LIMIT_S)
 
     def observe(self, stamp_us: int, _truth: Truth) -> None:
-        """Handle all messages that the firmware has sent up to a stamp.
+        """Handle all messages that the firmware has sent so far.
 
-        Raises VehicleProcessError if it closed its link, or has been silent for a minute.
+        `stamp_us` is the simulated time. Raises VehicleProcessError if the firmware has closed its
+        link, or has been silent for a minute of simulated time.
         """
         while self._receive(0.0):
             self._heard_us = stamp_us
         if stamp_us - self._heard_us > _SILENCE_US:
             limit_s = _SILENCE_US / 1e6
-            raise VehicleProcessError(f"the firmware sent no MAVLink for {limit_s:g} s")
+            raise VehicleProcessError(
+                f"the firmware sent no MAVLink for {limit_s:g} s of simulated time"
+            )
 
     def _receive(self, timeout_s: float) -> bool:
         try:
@@ -201,7 +211,7 @@ FIXED_PARAMETERS, _ = read_toml(Path(__file__).with_name("parameters.toml"))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Boot:
-    """The settings with which firmware is started."""
+    """The settings of one vehicle with which its firmware is started."""
 
     profile: VehicleProfile
     system_id: int
@@ -221,7 +231,7 @@ def _plain(line: str) -> str:
 
 
 class FirmwareProcess:
-    """A running firmware. `end` also kills its children and removes its scratch folder.
+    """Runs real firmware in a process of its own until `end` is called.
 
     The firmware runs in its scratch folder, with `environment` added to our environment. Raises
     VehicleProcessError if it cannot be started.
@@ -257,9 +267,9 @@ class FirmwareProcess:
         Raises VehicleProcessError if it does not exist or is not executable.
         """
         if not path.is_file():
-            raise VehicleProcessError(f"no firmware at {path}")
+            raise VehicleProcessError(f"cannot start the firmware, which is not a file: {path}")
         if not os.access(path, os.X_OK):
-            raise VehicleProcessError(f"no permission to execute {path}")
+            raise VehicleProcessError(f"cannot start the firmware, which is not executable: {path}")
         return path.resolve()
 
     def require_running(self) -> None:
@@ -268,7 +278,7 @@ class FirmwareProcess:
             raise VehicleProcessError(self._state())
 
     def explain(self, problem: str) -> VehicleProcessError:
-        """Return an error about the firmware with its state and its last lines of output."""
+        """Return an error with `problem`, the firmware's state and its last lines of output."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_DEATH_S)  # a link may close before its process has ended
         return VehicleProcessError(f"{problem}; {self._state()}")
@@ -287,13 +297,16 @@ class FirmwareProcess:
         return f"the firmware {self._binary} {how}{last}"
 
     def _keep_tail(self) -> None:
-        """Read the output until EOF, and keep its last bytes."""
+        """Read the firmware's output until EOF, and keep the last bytes of it."""
         with self._process.stdout as output:  # type: ignore[union-attr]
             while data := os.read(output.fileno(), _CHUNK):
                 self._tail[:] = (self._tail + data)[-_TAIL_BYTES:]
 
     def end(self) -> None:
-        """Kill it with all of its children and remove its folder. May be called repeatedly."""
+        """Kill the firmware and all its children, and remove its scratch folder.
+
+        Safe to call more than once.
+        """
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()

@@ -62,7 +62,7 @@ mavlink start -x -u {local} -r 4000000 -f -m onboard -o {remote}
 
 
 class Px4Link:
-    """One PX4 on the simulator link. The TCP port determines the number of the PX4 instance."""
+    """The simulator link to one PX4. The TCP port determines the number of the PX4 instance."""
 
     step_s = 0.004  # PX4's SITL takes inertial samples at 250 Hz
     settle_s = 12.0  # its boot time varies between flights; its estimator has settled by then
@@ -79,9 +79,10 @@ class Px4Link:
 
     @classmethod
     def open(cls, sensors: Sensors, *, ours: bool) -> Px4Link:
-        """Open the first free port of PX4's instances, or only the first port unless we start PX4.
+        """Open a TCP port to which a PX4 instance connects, and return the link on it.
 
-        Raises LinkError if all of them are in use.
+        If we start PX4 (`ours`), this is the first free port of all instances. Otherwise it is the
+        port of the first instance. Raises LinkError if no such port can be opened.
         """
         *others, last = range(PORT, PORT + (_INSTANCES if ours else 1))
         for port in others:
@@ -93,7 +94,10 @@ class Px4Link:
 
     @staticmethod
     def parameters(profile: VehicleProfile) -> dict[str, float]:
-        """Return PX4's parameters for a vehicle: rotors, thrust curve and rate loops."""
+        """Return the PX4 parameters that a vehicle needs, keyed by name.
+
+        They set the rotors, the thrust curve and the rate loops.
+        """
         loops, offset_m = RateLoops.of(profile), profile.rotor.arm_m / math.sqrt(2.0)
         parameters = FIXED_PARAMETERS["px4"].copy()
         for rotor, (forward, right, sense) in enumerate(_ROTORS):
@@ -112,15 +116,18 @@ class Px4Link:
         }
 
     def start(self, binary: Path, boot: Boot) -> FirmwareProcess:
-        """Start PX4's SITL binary, which is in `bin/` next to `etc/` with its startup files.
+        """Start PX4's SITL binary, which then connects to this link.
 
-        PX4 derives its heading from the magnetometer. Raises VehicleProcessError if it cannot be
+        The binary's folder, such as `bin/`, must be next to `etc/` with PX4's startup files. PX4
+        derives its heading from the magnetometer. Raises VehicleProcessError if it cannot be
         started.
         """
         program = FirmwareProcess.program(binary)
         startup = program.parent.parent / "etc"
         if not (startup / "init.d-posix" / "rcS").is_file():
-            raise VehicleProcessError(f"{binary} is not PX4: it has no startup files in {startup}")
+            raise VehicleProcessError(
+                f"{binary} is not PX4's SITL binary: PX4's startup files are not in {startup}"
+            )
         scratch = ScratchFolder("px4")
         folder, instance = scratch.path, self.port - PORT
         parameters = {**self.parameters(boot.profile), "MAV_SYS_ID": boot.system_id}
@@ -137,13 +144,13 @@ class Px4Link:
         return FirmwareProcess(program, arguments, scratch, environment)
 
     def has_called(self, timeout_s: float) -> bool:
-        """Return True once PX4 has sent a message, waiting at most `timeout_s`."""
+        """Return True if PX4 has sent a message, after waiting at most `timeout_s` for one."""
         if not self._has_called:
             self._take(timeout_s)
         return self._has_called
 
     def exchange(self, stamp_us: int, truth: Truth) -> Vector:
-        """Send the sensors of a step and return the motor outputs (4,) in 0..1.
+        """Send the sensor values of a physics step. Return PX4's newest motor outputs (4,), 0..1.
 
         Raises VehicleProcessError if PX4 has closed the link.
         """
@@ -170,7 +177,10 @@ class Px4Link:
             self._answers = self._take(max(remaining_s, 0.0)) >= stamp_us
 
     def _take(self, timeout_s: float) -> int:
-        """Handle the next bytes. Return the newest stamp that PX4 has answered, or -1."""
+        """Wait at most `timeout_s` for bytes, and handle the messages in them.
+
+        Return the newest stamp, us, that these messages answer, or -1 if they answer none.
+        """
         try:
             data = self._transport.receive(timeout_s)
         except LinkLost:
@@ -211,13 +221,16 @@ class Px4Link:
 
 
 def _throttles(message: Message) -> Vector:
-    """Return the first four motor outputs (4,) in 0..1; 0 for NaN, all 0 while disarmed."""
+    """Return the outputs (4,), in 0..1, of the four motors in HIL_ACTUATOR_CONTROLS.
+
+    An output of NaN counts as 0. While PX4 is disarmed, all outputs are 0.
+    """
     if not message.mode & _ARMED:
         return np.zeros(4)
     return np.clip(np.nan_to_num(np.array(message.controls[:4], dtype=np.float64)), 0.0, 1.0)
 
 
 def _is_running(instance: int) -> bool:
-    """Return True if the PX4 instance with this number runs already, so it cannot start again."""
+    """Return True if a PX4 instance with this number already runs, so that another cannot start."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         return probe.connect_ex(_SOCKET.format(instance)) == 0

@@ -41,26 +41,30 @@ class Sensors:
         self._origin = Origin()
 
     def inertial(self, truth: Truth) -> tuple[Vector, Vector]:
-        """Return rates (3,), rad/s, and specific force (3,), m/s^2, both in body FRD."""
+        """Return the measured rates (3,), rad/s, and specific force (3,), m/s^2, in body FRD."""
         noise = self._noise.standard_normal(6)
         rates = truth.rates_frd_radps + GYRO_RADPS * noise[:3]
         force = truth.in_body(truth.acceleration_ned_mps2 - _GRAVITY_NED_MPS2)
         return rates, force + ACCELEROMETER_MPS2 * noise[3:]
 
     def magnetic_field(self, truth: Truth) -> Vector:
-        """Return the magnetic field (3,), body FRD, gauss."""
+        """Return the measured magnetic field (3,) in gauss, in body FRD."""
         field = truth.in_body(FIELD_NED_GAUSS)
         return field + MAGNETOMETER_GAUSS * self._noise.standard_normal(3)
 
     def barometer(self, truth: Truth) -> tuple[float, float]:
-        """Return the air pressure, Pa, and the corresponding altitude above sea level, m."""
+        """Return the measured air pressure, Pa, and the altitude above sea level, m, for it."""
         altitude_m = self._origin.altitude_amsl_m - float(truth.position_ned_m[2])
         noise_pa = BAROMETER_PA * float(self._noise.standard_normal())
         pressure_pa = standard_pressure_pa(altitude_m) + noise_pa
         return pressure_pa, pressure_altitude_m(pressure_pa)
 
     def fix(self, truth: Truth) -> tuple[float, float, float, Vector]:
-        """Return a GPS fix: latitude, longitude (deg), altitude (m) and NED velocity (3,), m/s."""
+        """Return a GPS fix: latitude, longitude, altitude and velocity.
+
+        Latitude and longitude are in degrees, the altitude is in metres above sea level, and the
+        velocity (3,) is in NED m/s.
+        """
         noise = self._noise.standard_normal(6)
         north, east, down = truth.position_ned_m.tolist()
         latitude, longitude = self._origin.geodetic(

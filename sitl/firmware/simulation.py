@@ -1,4 +1,4 @@
-"""Simulates vehicle, camera and referee of a flight under real firmware (`--hil`, `--json`)."""
+"""Simulates vehicle, camera and referee while real firmware flies (`--hil`, `--json`)."""
 
 from __future__ import annotations
 
@@ -34,14 +34,15 @@ _START_LIMIT_S, _LOOK_S = 60.0, 0.2
 
 
 class FirmwareSimulation(Simulation):
-    """A simulation whose rotors are commanded by firmware, with one exchange per physics step.
+    """A simulation in which real firmware commands the rotors at every physics step.
 
     The firmware's state at a stamp arrives a step or two after the stamp. The camera takes its
     frame from the vehicle's true pose at the stamp of the newest state.
 
     Args:
-        kind: Firmware, one of LINKS.
-        binary: Its SITL program, which `close` ends; None if it is started externally.
+        kind: Name of the firmware, a key of LINKS.
+        binary: The firmware's SITL program, which is started here and which `close` ends, or None
+            if the firmware is started externally.
         seed: Seed of the sensors' noise.
         url: Link to which externally started firmware sends its MAVLink.
         system_id, camera, logs: See `Simulation`.
@@ -96,7 +97,7 @@ class FirmwareSimulation(Simulation):
             undo.pop_all()
 
     def begin(self, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Wait until the firmware connects and sends a position, or until stopped.
+        """Wait until the firmware has connected and sends its position, or until stopped.
 
         Raises VehicleProcessError if the firmware has ended, has sent no position within two
         simulated minutes, or, if we started it, has not connected within a minute.
@@ -107,7 +108,9 @@ class FirmwareSimulation(Simulation):
             self.stamp_us < self._link.settle_s * 1e6 or autopilot.state_stamp_us < 0
         ):
             if self.stamp_us > _POSITION_LIMIT_US:
-                raise VehicleProcessError("the firmware sent no position within 120 s")
+                raise VehicleProcessError(
+                    "the firmware sent no position within 120 s of simulated time"
+                )
             self.advance()
         autopilot.forget()
 
@@ -116,7 +119,11 @@ class FirmwareSimulation(Simulation):
         self._firmware.handle(message, link)
 
     def advance(self, between: Callable[[int], None] | None = None) -> None:
-        """See `Simulation`. If we started the firmware, an error shows its last lines of output."""
+        """Simulate one control tick in which the firmware flies. `between` is not called.
+
+        Raises VehicleProcessError, as in `Simulation`. If we started the firmware, the error shows
+        the last lines of the firmware's output.
+        """
         with self._explained():
             super().advance(between)
 
@@ -130,14 +137,18 @@ class FirmwareSimulation(Simulation):
             raise self._process.explain(str(error)) from None
 
     def close(self) -> None:
-        """End the process, if we started it, and close the links."""
+        """End the firmware if we started it, and close the links to it."""
         if self._process is not None:
             self._process.end()
         self._firmware.close()
         self._link.close()
 
     def _await_call(self, stopped: Callable[[], bool]) -> None:
-        """Wait until the firmware connects or until stopped, at most a minute if we started it."""
+        """Wait until the firmware connects, or until stopped.
+
+        Raises VehicleProcessError if we started the firmware and it ends first, or does not connect
+        within a minute.
+        """
         deadline_s = time.monotonic() + _START_LIMIT_S
         while not stopped():
             with self._explained():
@@ -147,7 +158,9 @@ class FirmwareSimulation(Simulation):
                 continue
             self._process.require_running()
             if time.monotonic() > deadline_s:
-                raise VehicleProcessError(f"no firmware connected within {_START_LIMIT_S:g} s")
+                raise VehicleProcessError(
+                    f"the firmware did not connect within {_START_LIMIT_S:g} s"
+                )
 
     def _fly(self, _between: Callable[[int], None] | None) -> None:
         autopilot = self._firmware

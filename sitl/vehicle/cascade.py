@@ -103,7 +103,7 @@ def _clip(value: float, low: float, high: float) -> float:
 
 @compiled
 def wrap(angle_rad: float) -> float:
-    """Wrap an angle into [-pi, pi), rad."""
+    """Wrap an angle in radians into [-pi, pi)."""
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
 
 
@@ -115,7 +115,7 @@ def _finite_or_nan(value: float, limit: float) -> float:
 
 @compiled
 def _limit_horizontal(vector: Vector, start: int, limit: float) -> None:
-    """Limit the norm of vector[start:start + 2] to `limit`. NaN counts as zero."""
+    """Limit the norm of vector[start:start + 2] to `limit`, in place. NaN counts as zero."""
     x = vector[start] if math.isfinite(vector[start]) else 0.0
     y = vector[start + 1] if math.isfinite(vector[start + 1]) else 0.0
     norm = math.sqrt(x * x + y * y)
@@ -126,10 +126,11 @@ def _limit_horizontal(vector: Vector, start: int, limit: float) -> None:
 
 @compiled
 def clean_setpoint(setpoint: Vector, gains: Vector) -> Vector:
-    """Return a copy (11,) within the vehicle's limits, with NaN for values that are not finite.
+    """Return a copy of a setpoint (11,) that is limited to what the vehicle can do.
 
     Velocity is limited to the horizontal speed (norm) and to the climb and descent limits, and
-    acceleration and yaw rate to their limits. Yaw is wrapped into [-pi, pi).
+    acceleration and yaw rate to their limits. Yaw is wrapped into [-pi, pi). Values that are not
+    finite become NaN.
     """
     clean = np.empty(SETPOINT_SIZE)
     for index in range(SP_YAW):  # position, then velocity and acceleration
@@ -202,7 +203,7 @@ def _model_acceleration(target: Vector, clean: Vector, state: Vector, gains: Vec
 
 @compiled
 def _drag(velocity_mps: Vector, axis: int, gains: Vector) -> float:
-    """Return the deceleration due to drag and inflow along a NED axis at a velocity (3,), m/s^2."""
+    """Return the deceleration, m/s^2, from drag and inflow along a NED axis at a velocity (3,)."""
     v: float = velocity_mps[axis]
     slowing: float = gains[G_DRAG_LINEAR + axis] + gains[G_DRAG_QUADRATIC + axis] * abs(v)
     return v * slowing
@@ -212,7 +213,7 @@ def _drag(velocity_mps: Vector, axis: int, gains: Vector) -> float:
 def acceleration_target(
     target: Vector, clean: Vector, measurement: Vector, state: Vector, gains: Vector
 ) -> Vector:
-    """Return the target acceleration of the rotors (3,), NED m/s^2, and advance `state`.
+    """Return the acceleration (3,) that the rotors must give, NED m/s^2, and advance `state`.
 
     It is the feed-forward of the model's acceleration and of drag, plus P and a limited I of the
     difference between model and vehicle.
@@ -242,7 +243,7 @@ def acceleration_target(
 
 @compiled
 def rotation(measurement: Vector) -> Vector:
-    """Return the rotation matrix (3, 3), body FRD -> NED, of the measured attitude."""
+    """Return the rotation matrix (3, 3) from body FRD to NED for the measured attitude."""
     w, x, y, z = measurement[T_QUATERNION : T_QUATERNION + 4]
     matrix = np.empty((3, 3))
     matrix[0, 0] = 1.0 - 2.0 * (y * y + z * z)
@@ -259,7 +260,7 @@ def rotation(measurement: Vector) -> Vector:
 
 @compiled
 def specific_force(acceleration: Vector, gains: Vector) -> Vector:
-    """Return the thrust per mass (3,), NED m/s^2, for an acceleration, with priority for height.
+    """Return the thrust per mass (3,), NED m/s^2, that gives an acceleration (3,) within limits.
 
     The vertical part has priority over all of the horizontal part except for a margin. The
     horizontal part is limited by the tilt limit and by the remaining thrust.
@@ -281,7 +282,7 @@ def specific_force(acceleration: Vector, gains: Vector) -> Vector:
 
 @compiled
 def _unwind(acceleration: Vector, force: Vector, state: Vector, gains: Vector) -> None:
-    """Unwind the velocity integrals in `state` that push into a limit."""
+    """Reduce the velocity integrals in `state` that demand more force than the limits allow."""
     for axis in range(3):
         had = force[axis] + (gains[G_GRAVITY] if axis == 2 else 0.0)
         step = gains[G_DT] * UNWINDING_HZ * abs(had - acceleration[axis])
@@ -293,7 +294,7 @@ def _unwind(acceleration: Vector, force: Vector, state: Vector, gains: Vector) -
 
 @compiled
 def tilt_rates(force: Vector, matrix: Vector, gains: Vector) -> Vector:
-    """Return the body rates (3,), rad/s, without yaw, that align the thrust axis with the force."""
+    """Return the body rates (3,), rad/s, that turn the thrust axis towards a force. Yaw is zero."""
     norm = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
     # target down axis in body coordinates
     x = -(matrix[0, 0] * force[0] + matrix[1, 0] * force[1] + matrix[2, 0] * force[2]) / norm
@@ -313,7 +314,7 @@ def tilt_rates(force: Vector, matrix: Vector, gains: Vector) -> Vector:
 
 @compiled
 def _heading_rate(clean: Vector, heading: float, state: Vector, gains: Vector) -> float:
-    """Return the yaw rate around the vertical, rad/s, and advance the heading reference."""
+    """Return the yaw rate to command, rad/s around the vertical, and advance the reference."""
     dt = gains[G_DT]
     limit = gains[G_YAW_RATE_LIMIT]
     wanted = clean[SP_YAW_RATE] if math.isfinite(clean[SP_YAW_RATE]) else 0.0
@@ -365,7 +366,7 @@ def _torque(
 
 @compiled
 def thrust_shares(collective_n: float, torque_nm: Vector, gains: Vector) -> Vector:
-    """Return the thrust of the rotors (4,) as shares of the maximum, within [LEAST_SHARE, 1].
+    """Return the thrust of each rotor (4,) as a share of its maximum, within [LEAST_SHARE, 1].
 
     If the rotors saturate, roll and pitch have priority, then the collective, then yaw.
     """
@@ -393,7 +394,11 @@ def thrust_shares(collective_n: float, torque_nm: Vector, gains: Vector) -> Vect
 
 @compiled
 def throttle(share: float, gains: Vector) -> float:
-    """Return the motor command in [0, 1] for a static thrust share: voltage = V(rotor speed)."""
+    """Return the motor command, in [0, 1], that gives a share of a rotor's maximum static thrust.
+
+    The command is the motor's voltage at the rotor speed of that thrust, relative to the voltage
+    at full throttle.
+    """
     speed = math.sqrt(share)
     command = gains[G_THROTTLE] + gains[G_THROTTLE + 1] * speed + gains[G_THROTTLE + 2] * share
     return _clip(command, 0.0, 1.0)
@@ -401,7 +406,7 @@ def throttle(share: float, gains: Vector) -> float:
 
 @compiled
 def mix(collective_n: float, torque_nm: Vector, gains: Vector) -> Vector:
-    """Return motor commands (4,) in [0, 1] for collective thrust, N, and torque (3,), N m."""
+    """Return the motor commands (4,), in [0, 1], for a collective thrust and a torque (3,)."""
     commands = thrust_shares(collective_n, torque_nm, gains)
     for rotor in range(4):
         commands[rotor] = throttle(commands[rotor], gains)
@@ -410,7 +415,10 @@ def mix(collective_n: float, torque_nm: Vector, gains: Vector) -> Vector:
 
 @compiled
 def _resting_state(measurement: Vector, matrix: Vector) -> Vector:
-    """Return the controller state (n,) on the ground: zero integrals, references at rest."""
+    """Return the controller state (21,) of a vehicle on the ground.
+
+    The integrals are zero, and the references are the measured heading, velocity and rates.
+    """
     state = np.zeros(STATE_SIZE)
     state[S_HEADING] = math.atan2(matrix[1, 0], matrix[0, 0])
     for axis in range(3):

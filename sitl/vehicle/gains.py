@@ -21,7 +21,9 @@ TILT_TO_RATE = 0.36  # tilt gain / natural frequency of the rate loop
 
 
 def gains_for(profile: VehicleProfile, dt_s: float) -> Vector:
-    """Return the gain array (cascade.GAINS_SIZE,) for a vehicle and a step of `dt_s`.
+    """Return the gains of a vehicle's controller, as an array of shape (cascade.GAINS_SIZE,).
+
+    `dt_s` is the controller's step.
 
     The rate loop is designed as a second-order system with the motor's lag tau: torque
     I (P e - D w') gives tau s^2 + (1 + D) s + P. The outer gains follow from its natural frequency.
@@ -80,7 +82,10 @@ def _outer(gains: Vector, profile: VehicleProfile) -> None:
 
 
 def _drag(gains: Vector, profile: VehicleProfile) -> None:
-    """Set body drag and the thrust loss of climbing rotors: dT/dV = slope T / (J0 n D)."""
+    """Set the gains for body drag and for the thrust loss of climbing rotors.
+
+    The thrust loss is dT/dV = slope T / (J0 n D).
+    """
     rotor, mass_kg = profile.rotor, profile.total_mass_kg
     hover_n = mass_kg * GRAVITY_MPS2 / 4.0
     speed_hz = math.sqrt(hover_n / rotor.max_thrust_n) * rotor.max_rpm / 60.0
@@ -111,9 +116,9 @@ _REDUCED = 0.6  # real firmware filters its gyroscope, and its outputs are a ste
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RateLoops:
-    """Rate loops for real firmware: ours with reduced gains, and the data to convert them.
+    """The gains of our rate loops, reduced for real firmware, and the data to convert them.
 
-    A firmware's gain is torque as a share of its mixer's torque at full command.
+    A firmware's gain gives the torque as a share of its mixer's torque at full command.
     """
 
     p: Vector  # (3,) N m of torque per rad/s
@@ -127,7 +132,7 @@ class RateLoops:
 
     @classmethod
     def of(cls, profile: VehicleProfile) -> RateLoops:
-        """Return the rate loops for a vehicle."""
+        """Return the rate loops for the vehicle of a profile."""
         gains = gains_for(profile, 0.004)
         shares = np.linspace(0.05, 1.0, 40)
         commands = np.array([cascade.throttle(share, gains) for share in shares])
@@ -148,9 +153,12 @@ class RateLoops:
     def parameters(
         self, pattern: str, axes: Sequence[str], shares: Sequence[float]
     ) -> dict[str, float]:
-        """Return the gains under names like "MC_{axis}RATE_{term}", for roll, pitch and yaw.
+        """Return the firmware's P, I and D gains for roll, pitch and yaw, keyed by parameter name.
 
-        A share is the fraction of `tilt_nm` or `yaw_nm` that full command produces about its axis.
+        Args:
+            pattern: Pattern of the names, such as "MC_{axis}RATE_{term}".
+            axes: Names of roll, pitch and yaw in the pattern.
+            shares: For each axis, the fraction of `tilt_nm` or `yaw_nm` that full command produces.
         """
         full = (self.tilt_nm, self.tilt_nm, self.yaw_nm)
         return {

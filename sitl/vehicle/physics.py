@@ -1,4 +1,4 @@
-"""JSBSim: writes the files of a vehicle profile, and steps its physics under motor commands."""
+"""Writes JSBSim's files for a vehicle profile, and steps the physics under motor commands."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FOOT_POUND_J = 1.3558179483314004
 
 
 def write_model(profile: VehicleProfile, root: Path) -> None:
-    """Write the JSBSim files of a profile below `root`: planet.xml, aircraft/ and engine/."""
+    """Write the JSBSim files for a profile to `root`: planet.xml, aircraft/ and engine/."""
     values = _values(profile)
     for template in _MODEL.rglob("*.xml"):
         path = root / template.relative_to(_MODEL)
@@ -69,16 +69,20 @@ def _values(profile: VehicleProfile) -> dict[str, float | str]:
 
 
 def _table(ratio: float, static: float, share: Callable[[float], float]) -> str:
-    """Return table rows of a coefficient for advance ratios from -1 to 1.5 times `ratio`."""
+    """Return the rows of a JSBSim table for advance ratios from -1 to 1.5 times `ratio`.
+
+    A row is an advance ratio and the coefficient there: `static` times `share` of the ratio.
+    """
     advances = [step / 20.0 for step in range(-20, 31)]
     return "\n".join(f"{j * ratio:.6f} {static * share(j):.9f}" for j in advances)
 
 
 def thrust_share(relative_advance: float) -> float:
-    """Return C_T / static C_T at J / J(zero thrust), a shape common to fixed-pitch propellers.
+    """Return a propeller's thrust coefficient as a share of its static thrust coefficient.
 
-    It falls slowly at first and then faster. The shape is an assumption; it agrees within 5 % with
-    published data of 9-inch propellers.
+    `relative_advance` is the advance ratio divided by the one at which thrust vanishes. The share
+    falls slowly at first and then faster, as is common for fixed-pitch propellers. The shape is an
+    assumption; it agrees within 5 % with published data of 9-inch propellers.
     """
     if relative_advance < 0.0:
         return 1.0 - INFLOW_SLOPE * relative_advance
@@ -86,7 +90,10 @@ def thrust_share(relative_advance: float) -> float:
 
 
 def power_share(relative_advance: float) -> float:
-    """Return C_P / static C_P at J / J(zero thrust); see `thrust_share`."""
+    """Return a propeller's power coefficient as a share of its static power coefficient.
+
+    `relative_advance` is as in `thrust_share`.
+    """
     if relative_advance < 0.0:
         return 1.0 - 0.2 * relative_advance
     return max(1.0 - 0.2 * relative_advance - 0.7 * relative_advance**2, 0.02)
@@ -109,7 +116,10 @@ RAW_SIZE = len(RAW_PROPERTIES)
 
 
 class Physics:
-    """A JSBSim instance that simulates a profile over flat, fixed ground."""
+    """A JSBSim instance that simulates the vehicle of a profile above flat, fixed ground.
+
+    Raises VehicleProcessError if JSBSim cannot load the vehicle.
+    """
 
     def __init__(
         self, profile: VehicleProfile, *, position_ned_m: Vector, heading_rad: float, dt_s: float
@@ -129,20 +139,23 @@ class Physics:
         self._run = self._fdm.run
 
     def advance(self, commands: Vector) -> None:
-        """Advance one step with motor commands (4,) in 0..1."""
+        """Advance the physics by one step under motor commands (4,) in 0..1."""
         for write, command in zip(self._writers, commands.tolist(), strict=True):
             write(command)
         self._run()
 
     def read(self, raw: Vector) -> None:
-        """Fill `raw` (RAW_SIZE,) in JSBSim's units: ft, ft/s, rad, rad/s, rpm, ft lbf/s."""
+        """Fill `raw` (RAW_SIZE,) with the values of RAW_PROPERTIES, in JSBSim's units.
+
+        These are ft, ft/s, rad, rad/s, rpm and ft lbf/s.
+        """
         raw[:] = [read() for read in self._readers]
 
 
 def _node(fdm: jsbsim.FGFDMExec, name: str) -> jsbsim.FGPropertyNode:
     node = fdm.get_property_manager().get_node(name)
     if node is None:
-        raise VehicleProcessError(f"this JSBSim has no property {name!r}")
+        raise VehicleProcessError(f"the installed version of JSBSim lacks the property {name!r}")
     return node
 
 
@@ -160,7 +173,7 @@ def _load(profile: VehicleProfile, folder: Path, dt_s: float) -> jsbsim.FGFDMExe
 
 
 def _place(fdm: jsbsim.FGFDMExec, position_ned_m: Vector, heading_rad: float) -> None:
-    """Set the initial state: at rest at a position (3,) and heading."""
+    """Set JSBSim's initial state: at rest, at a position (3,) and with a heading."""
     north, east, down = (float(value) for value in position_ned_m)
     up = PLANET_RADIUS_M - down
     fdm["ic/lat-geod-rad"] = math.atan2(north, math.hypot(up, east))

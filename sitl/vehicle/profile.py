@@ -77,15 +77,16 @@ class _Rotor:
 
     @property
     def full_throttle_voltage_v(self) -> float:
-        """Voltage at which the static propeller turns at `max_rpm`, applied at throttle 1."""
+        """Motor voltage at full throttle, V, at which the static propeller turns at `max_rpm`."""
         torque_nm = self.max_thrust_n * self.torque_per_thrust_m
         current_a = torque_nm / self.torque_constant_nmpa + self.motor_no_load_current_a
         return self.max_rpm / self.motor_kv_rpmpv + current_a * self.motor_resistance_ohm
 
     def time_constant_s(self, thrust_n: float) -> float:
-        """Return the lag of rotor speed behind voltage, s, linearised at a thrust per rotor, N.
+        """Return the time constant, in seconds, with which a rotor's speed follows its voltage.
 
-        J dw/dt = Kt (V - w Kt) / R - Q(w), with Q proportional to w^2.
+        The equation J dw/dt = Kt (V - w Kt) / R - Q(w), with Q proportional to w^2, is linearised
+        at the rotor's thrust `thrust_n`.
         """
         share = math.sqrt(thrust_n / self.max_thrust_n)
         speed_radps = share * self.max_rpm * math.pi / 30.0
@@ -103,7 +104,7 @@ class _Drag:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Gear:
-    """Four landing legs on the diagonals."""
+    """Four landing legs on the diagonals of the frame, with springs and dampers."""
 
     leg_radius_m: float  # from the centre, horizontally
     height_m: float  # centre of mass above the unloaded feet
@@ -114,7 +115,7 @@ class _Gear:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Battery:
-    """A lithium pack with the drive train up to the shafts."""
+    """A lithium battery pack, and the drive train from it to the rotors' shafts."""
 
     cells: int
     capacity_ah: float
@@ -126,7 +127,11 @@ class _Battery:
     avionics_w: float
 
     def parameters(self) -> Vector:
-        """Return (8,): 4 open-circuit voltages, resistance, capacity C, efficiency, avionics W."""
+        """Return the numbers that the battery model needs, as an array of shape (8,).
+
+        They are the open-circuit voltages of the empty, nominal, middle and full pack (V), its
+        resistance (ohm), its capacity (C), the drive efficiency and the avionics' power (W).
+        """
         middle = self.cell_nominal_v + _MIDDLE * (self.cell_full_v - self.cell_nominal_v)
         cells = (self.cell_empty_v, self.cell_nominal_v, middle, self.cell_full_v)
         volts = [self.cells * voltage for voltage in cells]
@@ -166,14 +171,17 @@ class _EnergyRegression:
     b9: float
 
     def coefficients(self, payload_kg: float) -> Vector:
-        """Return b1..b6 and the constant term for a payload (7,)."""
+        """Return b1 to b6 and the constant term for a payload, as an array of shape (7,)."""
         constant = self.b9 + self.b7 * payload_kg * 1000.0
         return np.array([self.b1, self.b2, self.b3, self.b4, self.b5, self.b6, constant])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleProfile:
-    """A quadrotor. Body axes: x forward, y right, z down (FRD) unless named otherwise."""
+    """The physical description of a quadrotor, with the limits of its controller.
+
+    The body axes are x forward, y right, z down (FRD) unless a name says otherwise.
+    """
 
     name: str
     description: str = ""
@@ -226,7 +234,7 @@ class VehicleProfile:
 
     @property
     def physics(self) -> dict[str, float]:
-        """Return take-off mass, static thrust and hover power for a flight's record."""
+        """Take-off mass, static thrust of all rotors and hover shaft power, for flight records."""
         return {
             "mass_kg": self.total_mass_kg,
             "rotor_pull_n": self.max_thrust_n,
@@ -246,7 +254,7 @@ class VehicleProfile:
 
 
 def _numbers(record: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
-    """Yield every number of a nested dataclass with its dotted key."""
+    """Yield the dotted key and the value of every number in a nested dataclass."""
     for field in dataclasses.fields(record):
         value, key = getattr(record, field.name), f"{prefix}{field.name}"
         if dataclasses.is_dataclass(value):
@@ -293,7 +301,7 @@ class _StandIn:
                 raise ValueError(f"{key}: must be above 0, got {value:g}")
 
     def profile(self, base: VehicleProfile) -> VehicleProfile:
-        """Return the scaled quadrotor.
+        """Return the base quadrotor, scaled to the other vehicle.
 
         - Inertia grows with mass_kg, because the shape stays the same. Payload adds none, because
           it is at the centre of mass.

@@ -32,7 +32,9 @@ class _Scalar:
 
 
 class Truth:
-    """Read-only view of the newest state. It is updated in place, so copy values to keep them.
+    """Read-only view of the vehicle's true state.
+
+    The arrays are views of the newest state, which changes in place, so copy values to keep them.
 
     The position is that of the centre of mass in the NED frame at the world origin on the ground.
     """
@@ -65,7 +67,7 @@ class Truth:
 
     @property
     def euler_rad(self) -> tuple[float, float, float]:
-        """Roll, pitch and yaw from north, z-y-x."""
+        """Roll, pitch, and yaw from north, in radians: the z-y-x Euler angles of the attitude."""
         w, x, y, z = self.quaternion_frd_ned.tolist()
         return (
             math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
@@ -78,7 +80,7 @@ class Truth:
         return rotate(rotation_matrix(self.quaternion_frd_ned).T, vector_ned)
 
     def wreck(self) -> Truth:
-        """Return the state of a vehicle that stays where it is with its motors stopped."""
+        """Return a copy of the state in which the vehicle lies still with its motors stopped."""
         flat = self.flat.copy()
         flat[T_VELOCITY:T_QUATERNION] = 0.0  # and acceleration
         flat[T_RATES:T_RPM] = 0.0  # and motor commands

@@ -43,10 +43,11 @@ PHYSICS_DT_S = 0.004
 
 @compiled
 def regression_power(velocity_mps: Vector, acceleration_mps2: Vector, b: Vector) -> float:
-    """Return rotor power, W, for velocity (3,), acceleration (3,) and coefficients (7,).
+    """Return the rotor power, W, that a published regression gives for a vehicle's motion.
 
-    The regression is that of Tseng et al., arXiv 1703.10049, with speeds in km/h and
-    accelerations in km/h/s as in AirSim's fork. The result is never below zero.
+    The motion is a velocity (3,) and an acceleration (3,), and `b` has the coefficients (7,). The
+    regression is that of Tseng et al., arXiv 1703.10049, with speeds in km/h and accelerations in
+    km/h/s as in AirSim's fork. The result is never below zero.
     """
     v = KMH_PER_MPS * math.sqrt(velocity_mps[0] ** 2 + velocity_mps[1] ** 2)
     a = KMH_PER_MPS * math.sqrt(acceleration_mps2[0] ** 2 + acceleration_mps2[1] ** 2)
@@ -60,7 +61,7 @@ def regression_power(velocity_mps: Vector, acceleration_mps2: Vector, b: Vector)
 
 @compiled
 def open_circuit_voltage(remaining: float, parameters: Vector) -> float:
-    """Return the voltage of the unloaded pack, V, at a remaining charge in 0..1."""
+    """Return the voltage of the unloaded battery, V, at a remaining charge in 0..1."""
     for segment in range(3):
         if remaining <= _KNEES[segment + 1]:
             share: float = (remaining - _KNEES[segment]) / (_KNEES[segment + 1] - _KNEES[segment])
@@ -72,9 +73,10 @@ def open_circuit_voltage(remaining: float, parameters: Vector) -> float:
 
 @compiled
 def battery_current(power_w: float, open_circuit_v: float, resistance_ohm: float) -> float:
-    """Return the current, A, at which the loaded pack delivers a power, W, or its maximum power.
+    """Return the current, A, at which the battery delivers `power_w`.
 
-    It is the smaller root of P = I (V - I R), in a form without cancellation.
+    It is the smaller root of P = I (V - I R), in a form without cancellation. If the battery cannot
+    deliver that power, it is the current at the battery's maximum power.
     """
     if 4.0 * resistance_ohm * power_w > open_circuit_v * open_circuit_v:
         return open_circuit_v / (2.0 * resistance_ohm)
@@ -84,7 +86,7 @@ def battery_current(power_w: float, open_circuit_v: float, resistance_ohm: float
 
 @compiled
 def _euler_quaternion(roll: float, pitch: float, yaw: float, out: Vector) -> None:
-    """Write the quaternion (4,) of the z-y-x rotation yaw, pitch, roll, rad, with w >= 0."""
+    """Write the quaternion of z-y-x Euler angles, in radians, to `out` (4,), with w >= 0."""
     cr, sr = math.cos(roll / 2.0), math.sin(roll / 2.0)
     cp, sp = math.cos(pitch / 2.0), math.sin(pitch / 2.0)
     cy, sy = math.cos(yaw / 2.0), math.sin(yaw / 2.0)
@@ -98,7 +100,7 @@ def _euler_quaternion(roll: float, pitch: float, yaw: float, out: Vector) -> Non
 
 @compiled
 def _observe_motion(raw: Vector, dt_s: float, truth: Vector) -> None:
-    """Update motion and rotors in `truth` from JSBSim's raw state."""
+    """Update the values of motion and rotors in `truth` from JSBSim's raw state."""
     for axis in range(3):
         sign = -1.0 if axis == 2 else 1.0
         velocity = sign * raw[physics.RAW_VELOCITY + axis] * physics.FOOT_M
@@ -122,7 +124,7 @@ def _observe_motion(raw: Vector, dt_s: float, truth: Vector) -> None:
 def _account_energy(
     truth: Vector, regression: Vector, battery: Vector, dt_s: float, armed: bool
 ) -> None:
-    """Update powers, energies and battery in `truth` after a step of `dt_s`."""
+    """Update the values of power, energy and battery in `truth` after a step of `dt_s`."""
     power_w = 0.0
     if armed:
         velocity = truth[T_VELOCITY : T_VELOCITY + 3]
@@ -179,17 +181,18 @@ def _refresh_and_control(
     setpoint: Vector,
     gains: Vector,
 ) -> None:
-    """Do all work between two steps of the physics in one call."""
+    """Update `truth` after a physics step, and run the controller for the next step."""
     truth[T_STAMP] = stamp_s
     _refresh(raw, commands, regression, battery, dt_s, armed, truth)
     _control(state, truth, setpoint, gains, armed, commands)
 
 
 class Quadrotor:
-    """Deterministic physics and flight controller of one quadrotor.
+    """Simulates one quadrotor with its flight controller, deterministically.
 
-    It starts at rest. The yaw is counter-clockwise from east. A start position (3,) lower than
-    `profile.rest_height_m`, the height of the centre of mass on standing legs, is raised to it.
+    The vehicle starts at rest at `position_enu_m` (3,). A position lower than
+    `profile.rest_height_m`, the height of the centre of mass when the vehicle stands, is raised to
+    that height. The yaw is counter-clockwise from east.
     """
 
     def __init__(
@@ -223,10 +226,10 @@ class Quadrotor:
         self._refresh(np.zeros(4), 0.0, armed=False)
 
     def step(self, setpoint: Vector, armed: bool, count: int = 1) -> None:
-        """Advance flight controller and physics by `count` steps; the motors stop unless `armed`.
+        """Advance flight controller and physics by `count` steps. The motors stop unless `armed`.
 
         The setpoint (11,) is x y z, vx vy vz, ax ay az, yaw, yaw rate in NED; m, m/s, m/s^2, rad,
-        rad/s. Values that are not finite are not controlled.
+        rad/s. A component that is not finite is not controlled.
         """
         commands, law = self._commands, (self._state, self._flat, setpoint, self._gains, armed)
         _control(*law, commands)

@@ -131,7 +131,7 @@ def _boxes(made: World) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line. Return its exit code."""
+    """Run `mavfi world` with the arguments, or with those of this process. Return the exit code."""
     return exit_code(
         lambda: _world.main(args=arguments, prog_name="mavfi world", standalone_mode=False)
     )

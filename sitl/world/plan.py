@@ -37,7 +37,7 @@ _STEPS = [(i, j, math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _WorldCheck:
-    """Result of `check_world`, lengths in m."""
+    """The result of `check_world`. All lengths are in metres."""
 
     clearance_m: float  # requested clearance
     start_clearance_m: float  # horizontal distance to the nearest box; inf without boxes
@@ -48,17 +48,20 @@ class _WorldCheck:
 
     @property
     def path_exists(self) -> bool:
-        """True if there is a path with the clearance."""
+        """True if a path with the requested clearance exists."""
         return self.path_m is not None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the result without corners; a distance is None without boxes."""
+        """Return the result as a dict for JSON, without the corners of the path.
+
+        The clearances of start and goal are None if the world has no boxes.
+        """
         keys = ("clearance_m", "path_m", "straight_m", "start_clearance_m", "goal_clearance_m")
         return {"path_exists": self.path_exists, **plain({key: getattr(self, key) for key in keys})}
 
 
 def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> _WorldCheck:
-    """Search for a path from start to goal with `clearance_m` to every box.
+    """Search for a path from start to goal that keeps `clearance_m` from every box.
 
     Raises WorldError if the world is too large for the grid.
     """
@@ -86,12 +89,16 @@ def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> _W
 
 
 def _free_grid(world: World, height_m: float, clearance_m: float) -> tuple[Mask, Vector]:
-    """Return the free cells (columns, rows) at a height, and the lower corner (2,), ENU m."""
+    """Return which grid cells are free at a height, and the position of the grid's lower corner.
+
+    The cells are a mask of shape (columns, rows). The corner has shape (2,), in ENU m. Raises
+    WorldError if the grid would have too many cells.
+    """
     origin = world.bounds_enu_m[:2]
     cells = np.maximum(1.0, np.ceil((world.bounds_enu_m[3:5] - origin) / _CELL_M))
     if math.prod(cells.tolist()) > _MOST_CELLS:
         raise WorldError(
-            f"world {world.name!r} is too large to check: its grid must be at most "
+            f"world {world.name!r} is too large to check: its grid must have at most "
             f"{_MOST_CELLS:g} cells, got {cells[0]:g} x {cells[1]:g}"
         )
     x, y = (at + (np.arange(int(n)) + 0.5) * _CELL_M for at, n in zip(origin, cells, strict=True))
@@ -106,7 +113,10 @@ def _free_grid(world: World, height_m: float, clearance_m: float) -> tuple[Mask,
 
 
 def _shortest(free: Mask, start: Cell, goal: Cell) -> list[Cell]:
-    """Return the cells of a shortest path, empty if none exists, by A* with straight distances."""
+    """Return the cells of a shortest path, by A* with the straight-line distance as heuristic.
+
+    The list is empty if no path exists.
+    """
     shape = free.shape
     if not (free[start] and free[goal]):
         return []
@@ -135,7 +145,10 @@ def _shortest(free: Mask, start: Cell, goal: Cell) -> list[Cell]:
 
 
 def _straighten(free: Mask, cells: list[Cell]) -> list[Cell]:
-    """Return the corners of a path of cells: each is the last cell in sight of the one before."""
+    """Return the cells at which a straightened path turns, with the path's first and last cell.
+
+    Each of them is the last cell of the original path that is visible from the one before it.
+    """
     corners, at, last = [cells[0]], 0, len(cells) - 1
     while at < last:
         ahead = (place for place in range(last, at, -1) if _sees(free, cells[at], cells[place]))
@@ -158,10 +171,10 @@ _WIDTH_IN = 5.2
 
 
 def world_svg(world: World, path_enu_m: Vector | None = None) -> bytes:
-    """Return the SVG of a world from above, with a path (n, 3) if given; axes in m.
+    """Return an SVG picture of a world from above, with axes in metres.
 
-    Boxes that end 1 m or more below the goal's height are green, because the flight passes over
-    them. The same world gives the same bytes.
+    A given path, of shape (n, 3), is drawn as well. Boxes that end 1 m or more below the goal's
+    height are green, because the flight passes over them. The same world gives the same bytes.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure

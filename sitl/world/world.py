@@ -54,14 +54,15 @@ _DEFAULT_GOAL_ENU_M = np.array([30.0, 40.0, 5.0])
 
 
 def format_place(place: Vector) -> str:
-    """Format a point like (30, 40, 5)."""
+    """Return a point as text, such as `(30, 40, 5)`."""
     return "(" + ", ".join(f"{float(c):g}" for c in place) + ")"
 
 
 def distance_to_boxes(boxes_enu_m: Vector, place_enu_m: Vector, *, plan: bool = False) -> Vector:
-    """Return the distances (n,), m, from a point (3,) to boxes (n, 6); zero inside.
+    """Return the distance in metres from a point to each box, as an array of shape (n,).
 
-    With `plan`, only the horizontal distance counts.
+    The boxes have shape (n, 6) and the point has shape (3,). The distance to a box that contains
+    the point is zero. With `plan`, distances are horizontal.
     """
     apart = np.maximum(boxes_enu_m[:, :3] - place_enu_m, place_enu_m - boxes_enu_m[:, 3:])
     apart = np.maximum(0.0, apart)
@@ -98,26 +99,27 @@ class World:
         flat = (self.boxes_enu_m[:, 3:] <= self.boxes_enu_m[:, :3]).any(axis=1)
         if flat.any():
             raise WorldError(
-                f"world {self.name!r}: box {int(flat.argmax())} must have max above min"
+                f"world {self.name!r}: the maximum of box {int(flat.argmax())} must be above its "
+                "minimum on every axis"
             )
         for what, place in (("start", self.start_enu_m), ("goal", self.goal_enu_m)):
             _refuse_bad_place(self.name, self.boxes_enu_m, self.bounds_enu_m, what, place)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the world for a record in JSON, lengths in m."""
+        """Return the world as a dict for a record in JSON, with lengths in metres."""
         keys = ("bounds", "start", "goal", "boxes")
         arrays = {key: getattr(self, f"{key}_enu_m").tolist() for key in keys}
         return {"name": self.name, "seed": self.seed, **arrays}
 
     def toml(self) -> str:
-        """Return the text of a world file, which reads back as the same world."""
+        """Return the text of a TOML file that describes this world, for `load_world` to read."""
         keys = ("bounds_enu_m", "start_enu_m", "goal_enu_m")
         places = {key: getattr(self, key).tolist() for key in keys}
         boxes = [{"min_enu_m": box[:3], "max_enu_m": box[3:]} for box in self.boxes_enu_m.tolist()]
         return toml_text({"name": self.name, **places, **({"box": boxes} if boxes else {})})
 
     def briefing(self, camera_mount_flu_m: Sequence[float]) -> Briefing:
-        """Return the data that the companion gets before its first message."""
+        """Return the briefing, which the companion gets before its first message."""
         places = (self.start_enu_m, self.goal_enu_m, self.bounds_enu_m, camera_mount_flu_m)
         start, goal, bounds, mount = (np.array(place, np.float64) for place in places)
         return Briefing(
@@ -125,7 +127,10 @@ class World:
         )
 
     def write_briefing(self, camera_mount_flu_m: Sequence[float], folder: Path) -> None:
-        """Write the briefing to a folder. Raises RecordError."""
+        """Write the briefing to `briefing.json` in a folder, which is created if necessary.
+
+        Raises RecordError if the file cannot be written.
+        """
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
         briefing = dataclasses.asdict(self.briefing(camera_mount_flu_m))
@@ -134,10 +139,10 @@ class World:
 
 
 def _refuse_bad_place(name: str, boxes: Vector, bounds: Vector, what: str, place: Vector) -> None:
-    """Raise PlaceError if a "start" or "goal" (3,) is outside the bounds (6,) or blocked.
+    """Raise PlaceError if a place (3,) is outside the bounds (6,) or blocked by a box (n, 6).
 
-    A start is blocked if a box (n, 6) is too close for the vehicle to stand there, a goal if it is
-    inside a box.
+    `what` is "start" or "goal". A start is blocked if a box is too close for the vehicle to stand
+    there, and a goal is blocked if it is inside a box.
     """
     subject = f"world {name!r}: {what} {format_place(place)}"
     if not _inside(bounds, place):
@@ -159,7 +164,10 @@ def _refuse_bad_place(name: str, boxes: Vector, bounds: Vector, what: str, place
 
 
 def _inside(bounds_enu_m: Vector, place_enu_m: Vector) -> bool:
-    """Return True if a point (3,) is within the bounds (6,) or on a face; NaN is outside."""
+    """Return True if a point (3,) is within the bounds (6,) or on one of their faces.
+
+    A point that contains NaN is outside.
+    """
     return bool((place_enu_m >= bounds_enu_m[:3]).all() and (place_enu_m <= bounds_enu_m[3:]).all())
 
 
@@ -170,14 +178,16 @@ def load_world(
     start_enu_m: Sequence[float] | Vector | None = None,
     goal_enu_m: Sequence[float] | Vector | None = None,
 ) -> World:
-    """Load a world by name, `gen:density,size` or path of a TOML file, for one seed.
+    """Load a world from its name, `gen:density,size` or the path of a TOML file, for one seed.
 
-    The same seed always gives the same world. Start and goal (3,), ENU m, replace the world's own.
+    The same seed always gives the same world. `start_enu_m` and `goal_enu_m`, of shape (3,),
+    replace the world's own start and goal.
 
     Raises:
-        UnknownName: No world has this name. The message suggests the nearest.
-        PlaceError: Start or goal is outside or blocked.
-        WorldError: The generator spec is invalid.
+        UnknownName: No world has this name. The message suggests the nearest name.
+        PlaceError: Start or goal is outside the world or blocked.
+        WorldError: The seed or the generator's parameters are invalid, or the seed gives no start
+            and goal in a fixed scene.
         ConfigError: The file cannot be used. The message names file, line and key.
     """
     if seed < 0:
@@ -197,7 +207,7 @@ def load_world(
 
 
 def named_worlds() -> dict[str, str]:
-    """Return descriptions of all named worlds by their names, evaluation worlds first."""
+    """Return the descriptions of all named worlds, keyed by name. Evaluation worlds come first."""
     towers = {
         name: f"towers of {pair.size_m:g} x {pair.size_m:g} m in {100 * pair.density:g} % "
         "of the 10 x 10 m cells"
@@ -224,14 +234,14 @@ def _place(what: str, place: Sequence[float] | Vector | None) -> Vector | None:
 
 
 class _GeneratorError(WorldError):
-    """The parameters of the generator are invalid, which is a usage error."""
+    """Error for invalid parameters of the world generator, which count as a usage error."""
 
     exit_code = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Pair:
-    """The generator's two parameters and the family of the random streams."""
+    """The two parameters of the world generator, and the family of its random streams."""
 
     density: float  # probability that a cell contains an obstacle
     size_m: float  # side of the cuboid
@@ -270,9 +280,9 @@ def _pair_of_spec(text: str) -> _Pair | None:
 
 
 def _generate(name: str, pair: _Pair, seed: int, start: Vector, goal: Vector) -> World:
-    """Generate a world between a start (3,) and a goal (3,), ENU m.
+    """Generate a world around a start (3,) and a goal (3,), in ENU m.
 
-    The area contains start and goal with a margin of at least 20 m, in whole cells.
+    The area consists of whole cells, and extends at least 20 m beyond start and goal.
     """
     places = np.array([start, goal])
     if (np.ptp(places, axis=0) > _MAX_SPAN_M).any():
@@ -311,7 +321,7 @@ _Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Box:
-    """One obstacle with its corners in ENU, m."""
+    """One obstacle: a box, given by its lowest and its highest corner in ENU m."""
 
     min_enu_m: _Triple
     max_enu_m: _Triple
@@ -319,7 +329,8 @@ class _Box:
     def __post_init__(self) -> None:
         if any(high <= low for low, high in zip(self.min_enu_m, self.max_enu_m, strict=True)):
             raise ValueError(
-                f"max_enu_m must be above min_enu_m {self.min_enu_m}, got {self.max_enu_m}"
+                f"max_enu_m must be above min_enu_m {self.min_enu_m} on every axis, "
+                f"got {self.max_enu_m}"
             )
 
 
@@ -342,12 +353,13 @@ def _shipped(name: str) -> _Scene:
 def _world_of_scene(
     scene: _Scene, name: str, seed: int, start: Vector | None, goal: Vector | None
 ) -> World:
-    """Return the world of a scene; a start or goal (3,) replaces the scene's own."""
+    """Return the world of a scene. A given start or goal (3,) replaces the scene's own."""
     boxes = np.array([[*b.min_enu_m, *b.max_enu_m] for b in scene.box]).reshape(-1, 6)
     bounds = np.array(scene.bounds_enu_m, dtype=np.float64)
     if (bounds[3:] <= bounds[:3]).any():
         raise WorldError(
-            f"world {name!r}: bounds_enu_m must have max above min, got {bounds.tolist()}"
+            f"world {name!r}: the maximum of bounds_enu_m must be above its minimum on every axis, "
+            f"got {bounds.tolist()}"
         )
     start = _place("start", scene.start_enu_m) if start is None else start
     goal = _place("goal", scene.goal_enu_m) if goal is None else goal
@@ -386,6 +398,6 @@ def _choose(
         ):
             return from_, to
     raise WorldError(
-        f"world {name!r}, seed {seed}: no clear start and goal {least:g} to {most:g} m apart; "
-        "give start_enu_m and goal_enu_m"
+        f"world {name!r}, seed {seed}: found no start and goal that are {least:g} to {most:g} m "
+        "apart and clear of obstacles; set start_enu_m and goal_enu_m"
     )

@@ -99,7 +99,7 @@ def test_a_mission_of_strange_changes_is_refused(export, tmp_path, text):
     table, path = pq.read_table(export), tmp_path / "strange.parquet"
     place, texts = table.column_names.index("changes"), pa.array([text] * table.num_rows)
     pq.write_table(table.set_column(place, "changes", texts), path)
-    with pytest.raises(RecordError, match="changes of mission 0"):
+    with pytest.raises(RecordError, match="configuration of mission 0"):
         mission(path, 0)
 
 

@@ -225,11 +225,11 @@ def test_what_does_not_exist_gets_one_line(refused, tmp_path):
     for command_line in (("run",), ("status",), ("draw", "--output", "pair.svg"), ("export", "-")):
         name, *rest = command_line
         assert "did you mean 'table3'?" in refused(name, "table33", *rest)
-    assert "campaigns/table3: no campaign there" in refused("status", "table3")
-    assert "no campaign there" in refused("run", "./table3")
+    assert "campaigns/table3: holds no campaign" in refused("status", "table3")
+    assert "holds no campaign" in refused("run", "./table3")
     assert "no such file" in refused("run", "none.toml")
-    assert "no campaign there" in refused("status", tmp_path / "nowhere")
-    assert "no campaign there" in refused("draw", tmp_path / "nowhere", "--output", "pair.svg")
+    assert "holds no campaign" in refused("status", tmp_path / "nowhere")
+    assert "holds no campaign" in refused("draw", tmp_path / "nowhere", "--output", "pair.svg")
     assert "holds no campaign to resume" in refused(
         "run", written(tmp_path), "--missing-only", "--out", tmp_path / "nowhere"
     )

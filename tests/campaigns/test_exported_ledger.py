@@ -57,11 +57,11 @@ def test_its_commands_say_what_those_of_its_folder_say(mavfi, tmp_path):
     ("line", "code", "said"),
     [
         (("replay", EXPORT), 2, "--mission NUMBER (missions 0 to 639)"),
-        (("replay", EXPORT, "--mission", "640"), 1, "no flown mission 640"),
+        (("replay", EXPORT, "--mission", "640"), 1, "mission 640 has not been flown"),
         (("campaign", "draw", EXPORT, "--output", "a.svg"), 1, "no pair "),
         (("campaign", "draw", EXPORT, "--pair", "3", "--output", "a.svg"), 1, "no run folder of"),
-        (("campaign", "status", EXPORT, "--overhead"), 1, "name the campaign's folder"),
-        (("campaign", "run", EXPORT), 1, "an export has no list"),
+        (("campaign", "status", EXPORT, "--overhead"), 1, "use the campaign's folder"),
+        (("campaign", "run", EXPORT), 1, "cannot fly missions from an export"),
         (("campaign", "status", "absent.parquet"), 1, "absent.parquet: no such file"),
     ],
 )

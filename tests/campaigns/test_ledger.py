@@ -132,7 +132,7 @@ def test_another_version_is_refused(tmp_path):
     ("content", "error", "problem"),
     [
         (b"not a database" * 100, RecordError, "not a database"),
-        (None, RecordError, "no campaign there"),
+        (None, RecordError, "holds no campaign"),
     ],
 )
 def test_what_is_no_ledger_is_refused(tmp_path, content, error, problem):

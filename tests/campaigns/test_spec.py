@@ -93,7 +93,7 @@ def test_several_faults_share_an_invocation_and_everything_else_is_flown_once_fo
     assert [len(seeds) for seeds in places.values()] == [3] * 4
     assert len({pair for mission in missions if (pair := mission.pair)}) == 2
     assert spec_of(spec_of(text).to_toml()) == spec_of(text)
-    with pytest.raises(ConfigError, match="must be 1 with a stop rule"):
+    with pytest.raises(ConfigError, match="must be 1 with a stopping rule"):
         spec_of(f"{text}\n[stop]\nmargin = 0.1")
 
 

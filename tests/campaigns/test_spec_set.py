@@ -106,7 +106,7 @@ def test_a_long_name_ends_with_a_digest_of_the_changes():
         (("world=[]",), ConfigError, r"factors.world: .*at least one"),
         (("bits=1", "bits=3"), ConfigError, r"set: bits is set twice"),
         (("field=sign",), ConfigError, r"field: .*bits, detector, planner, "),
-        (("seed=3",), ConfigError, r"seed: .*no such factor"),
+        (("seed=3",), ConfigError, r"seed: .*not a factor of this campaign"),
         (("bits=one",), ConfigError, r"bits: .*whole number"),
         (("time_limit_s=long",), ConfigError, r"time_limit_s: must be a number"),
     ],
@@ -125,5 +125,5 @@ def test_another_injector_strikes_in_all_settings_at_instruction_level():
     faults = [config.instruction for config in missions if config.instruction is not None]
     assert len(faults) == 3 * 1200
     assert {fault.compat for fault in faults} == {"rosfi-2021"}
-    with pytest.raises(MavfiError, match="no such factor to replace"):
+    with pytest.raises(MavfiError, match="not a factor of this campaign"):
         replaced(load_spec("fig8"), ["compat=rosfi-2021"])

@@ -309,7 +309,7 @@ LINK = ["--link", "udpin:127.0.0.1:14540", "--goal", "1,2,3"]
         (["--firmware", "px4"], "--firmware needs --autopilot px4 or ardupilot"),
         (["--field", "sign"], "--field needs --inject"),
         (["--level", "instruction"], "--level instruction needs --inject NODE"),
-        (["--inject", "planning", "--restart", "5"], "--restart needs nodes"),
+        (["--inject", "planning", "--restart", "5"], "--restart has no effect unless a node"),
         (["--inject", "planning", "--duration", "5"], "--duration needs --persistence stuck-at"),
         (["--inject", "planning", "--bit", "3", "--bits", "2"], "--bits has no effect with --bit"),
         (["--inject", "planning", "--bit", "3", "--field", "sign"], "--field has no effect with"),
@@ -349,9 +349,9 @@ def no_firmware(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("autopilot", "kind", "said"),
     [
-        ("px4", "nothing", "no firmware at {path}"),
-        ("px4", "folder", "no firmware at {path}"),
-        ("px4", "text", "no permission to execute {path}"),
+        ("px4", "nothing", "cannot start the firmware, which is not a file: {path}"),
+        ("px4", "folder", "cannot start the firmware, which is not a file: {path}"),
+        ("px4", "text", "cannot start the firmware, which is not executable: {path}"),
         ("px4", "program", "{path} is not PX4"),
         ("ardupilot", "program", "true ended with code 0"),
     ],

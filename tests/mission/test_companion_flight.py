@@ -66,7 +66,7 @@ def test_a_flight_leaves_a_record_as_any_other(fly):
     assert any("Program     hop: started 1x" in line for line in summary_lines(run.record))
     draw_top_view(run)
     assert ViewedFlight(name="flight", run=run, recorder=None).run is run
-    with pytest.raises(RecordError, match="does not repeat"):
+    with pytest.raises(RecordError, match="is not repeatable"):
         fly_again(run, run.folder.path.parent)
 
 

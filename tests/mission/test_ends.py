@@ -79,7 +79,7 @@ def test_a_killed_mission_leaves_its_tlog(flying, mavfi):
     assert dumped(folder / "flight.tlog").count("LOCAL_POSITION_NED") > 400
     shown = mavfi("show", folder)
     assert shown.returncode == 1
-    assert shown.stderr.startswith(f"error: {folder}: no result.json ")
+    assert shown.stderr.startswith(f"error: {folder}: result.json is missing ")
     assert len(shown.stderr.splitlines()) == 1
 
 

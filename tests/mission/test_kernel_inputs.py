@@ -68,5 +68,5 @@ def test_the_same_mission_gives_the_same_bytes(config, inputs, tmp_path):
 @pytest.mark.slow
 def test_a_flight_without_a_detour_has_no_planning_problems(monkeypatch):
     monkeypatch.setattr("mavfi_cli.mission.kernel_inputs._FLIGHTS", 2)
-    with pytest.raises(TargetError, match="too few plans around obstacles"):
+    with pytest.raises(TargetError, match="had to avoid obstacles too few times"):
         record_inputs(MissionConfig(world="farm", seed=1, stack="hardened"))

@@ -115,5 +115,5 @@ def test_a_flight_on_this_host_ten_times_as_slow(fly_short):
     text = " ".join(" ".join(summary_lines(FlightRecord.of(result))).split())
     assert re.search(r"Measured .*octomap .* ms \(medians", text)
     assert "x 10 in the flight" in text
-    with pytest.raises(RecordError, match="does not repeat"):
+    with pytest.raises(RecordError, match="is not repeatable"):
         run.mission()

@@ -95,7 +95,7 @@ def test_long_names_of_settings_leave_room_for_the_dots():
 
 
 def test_a_table_without_rows_is_not_drawn():
-    with pytest.raises(RecordError, match="nothing to draw"):
+    with pytest.raises(RecordError, match="none of its missions has flown yet"):
         draw(replace(small_table(), rows=()), None, "one")
 
 
@@ -127,14 +127,14 @@ def test_what_is_drawn_is_what_the_table_says():
 @pytest.mark.parametrize("name", OF_FLIGHTS)
 def test_before_a_mission_has_flown_there_is_nothing_to_draw(name):
     nothing = flights([])
-    with pytest.raises(RecordError, match="no mission"):
+    with pytest.raises(RecordError, match="none of its missions"):
         draw(of_flights(name, nothing), nothing, "one")
 
 
 @pytest.mark.parametrize("name", ["fig8", "fig9"])
 def test_faults_by_place_need_a_fault(name):
     golden = flights([flight(20.0)])
-    with pytest.raises(RecordError, match="no mission"):
+    with pytest.raises(RecordError, match="none of its missions"):
         draw(of_flights(name, golden), golden, "one")
 
 

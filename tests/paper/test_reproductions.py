@@ -195,7 +195,7 @@ def test_another_campaign_is_refused(tmp_path):
 def test_other_versions_are_refused(copied, tmp_path):
     with Ledger(copied.folder, writing=True) as ledger:
         ledger.set_meta({"versions": '{"mavfi":"0.1"}'})
-    with pytest.raises(ConfigError, match="begun with other versions"):
+    with pytest.raises(ConfigError, match="versions have changed since it began"):
         flown(plan(tmp_path, "fig9", scale=0.03))
     with Ledger(copied.folder) as ledger:
         assert FlightsPlan.stored(ledger).scale == SCALE  # nothing was changed

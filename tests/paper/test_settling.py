@@ -76,10 +76,10 @@ def test_missions_are_flown_until_the_claim_is_decided(tmp_path, monkeypatch):
 
 def test_a_list_that_cannot_grow_is_refused(tmp_path):
     plan = FlightsPlan(items=items_named(["fig9"]), stack="mavbench", out=tmp_path / "x.parquet")
-    with pytest.raises(ConfigError, match="is an export"):
+    with pytest.raises(ConfigError, match="cannot add missions to an export"):
         require_settleable(plan)
     model = dataclasses.replace(plan, items=items_named(["fig15"]), out=tmp_path)
-    with pytest.raises(ConfigError, match="that flies missions"):
+    with pytest.raises(ConfigError, match="must fly missions"):
         require_settleable(model)
 
 

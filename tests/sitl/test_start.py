@@ -42,8 +42,8 @@ def run(capfd):
         (["--world", "farm", "--link", "udpin:0.0.0.0:14777"], "sign"),
         (["--world", "farm", "--camera-rate", "1000"], "camera rate"),
         (["--world", "farm", "--key-file", "/nowhere/key"], "/nowhere/key"),
-        (["--hil", "px4", "--firmware", "/nowhere/px4"], "no firmware at /nowhere/px4"),
-        (["--json", "ardupilot", "--firmware", "/etc/passwd"], "no permission to execute"),
+        (["--hil", "px4", "--firmware", "/nowhere/px4"], "is not a file: /nowhere/px4"),
+        (["--json", "ardupilot", "--firmware", "/etc/passwd"], "is not executable"),
     ],
 )
 def test_known_error_is_one_line(run, arguments, words):

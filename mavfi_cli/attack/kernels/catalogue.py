@@ -50,7 +50,7 @@ _DAMAGE = (
 
 
 def pack(output: Output) -> bytes:
-    """Pack the arrays in the order of the dictionary; equal outputs give equal bytes."""
+    """Pack the arrays of an output, in the dictionary's order. Equal outputs give equal bytes."""
     buffer = io.BytesIO()
     for name, array in output.items():
         np.save(buffer, np.array(name))
@@ -59,7 +59,7 @@ def pack(output: Output) -> bytes:
 
 
 def unpack(data: bytes) -> Numbers:
-    """Read what `pack` wrote.
+    """Unpack the arrays that `pack` has packed, keyed by name.
 
     Raises:
         ValueError: the bytes are not a packed output.
@@ -75,7 +75,7 @@ def unpack(data: bytes) -> Numbers:
 
 
 def _numbers(golden: Numbers, output: Numbers) -> Difference:
-    """Return the largest difference between corresponding numbers, relative and absolute.
+    """Return the largest difference between corresponding numbers of two outputs.
 
     Differences are relative to the golden number, or to 1 if that is 0; they are noticeable above
     `_SMALL`.
@@ -109,10 +109,12 @@ def _nan(array: NDArray[np.generic]) -> NDArray[np.bool_]:
 
 
 def _maps(golden: Numbers, output: Numbers) -> Difference:
-    """Compare two trees by the nodes that only one of them has or whose log-odds differ.
+    """Compare the OctoMap trees of two outputs by their nodes and occupied voxels.
 
-    The difference is noticeable if the sets of occupied voxels differ, in the tree or in the
-    planner's map.
+    The absolute difference is the number of nodes that `_Tree.difference` counts, and the relative
+    one is their number divided by that of the golden tree's nodes. If no node differs, the absolute
+    difference is the number of voxels. The difference is noticeable if the sets of occupied voxels
+    differ, in the tree or in the planner's map.
     """
     ours, theirs = _read_tree(golden["tree"].tobytes()), _read_tree(output["tree"].tobytes())
     if theirs is None or ours is None:
@@ -150,7 +152,7 @@ def _occupied(output: Numbers) -> set[tuple[int, int, int]]:
 
 
 def _checks(golden: Numbers, output: Numbers) -> Difference:
-    """Compare the predicted collisions pose by pose.
+    """Compare the collisions that two outputs predict, pose by pose.
 
     A missed or spurious collision is noticeable, and so is a shift in time above `_A_TICK_S`.
     """
@@ -176,9 +178,10 @@ def _checks(golden: Numbers, output: Numbers) -> Difference:
 
 
 def _paths(golden: Numbers, output: Numbers) -> Difference:
-    """Compare two planned paths by their lengths and by the largest distance between them, m.
+    """Compare two planned paths by their lengths and the largest distance between them, in metres.
 
-    The difference is noticeable if either exceeds `_HALF_A_VOXEL_M`.
+    The difference is noticeable if the lengths differ by more than `_HALF_A_VOXEL_M`, or if the
+    largest distance is above it.
     """
     path, another = golden["path_enu_m"], output["path_enu_m"]
     ours, theirs = path.astype(np.float64), another.astype(np.float64)
@@ -204,7 +207,10 @@ def _length(path: NDArray[np.float64]) -> float:
 
 
 def _farthest(path: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Return the largest distance from a vertex of one path (n, 3) to the other path (m, 3)."""
+    """Return the largest distance from a vertex of `path` to the path `other`.
+
+    The paths are arrays of vertices, of shapes (n, 3) and (m, 3).
+    """
     begins, steps = other[:-1], np.diff(other, axis=0)
     if not len(steps):
         begins, steps = other, np.zeros_like(other)
@@ -230,7 +236,7 @@ _NODE = np.dtype([("value", "<f4"), ("children", "u1")])
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Tree:
-    """All nodes of a tree, depth first."""
+    """All nodes of an OctoMap tree, in depth-first order."""
 
     values: NDArray[np.float32]  # (n,) log-odds
     codes: NDArray[np.int64]  # (n,) Morton code of the first voxel
@@ -268,7 +274,7 @@ class _Tree:
 
 
 def _read_tree(data: bytes) -> _Tree | None:
-    """Read a tree from the bytes of an `.ot` file; None if they are malformed."""
+    """Read a tree from the bytes of an `.ot` file. Return None if the bytes are malformed."""
     _, marker, nodes = data.partition(b"\ndata\n")
     if not marker or not nodes or len(nodes) % _NODE.itemsize:
         return None
@@ -289,7 +295,7 @@ def _read_tree(data: bytes) -> _Tree | None:
 def _place_nodes(
     children: NDArray[np.uint8], codes: NDArray[np.int64], depths: NDArray[np.int64]
 ) -> int:
-    """Fill codes and depths (n,) of nodes in the order of the file.
+    """Fill the arrays `codes` and `depths`, of shape (n,), for the nodes in the order of the file.
 
     Returns the number of nodes in the tree, or 0 if the nodes do not form a tree.
     """
@@ -324,8 +330,9 @@ class Kernel:
     Attributes:
         name: value of `--kernel`.
         title: name in tables.
-        prepare: maps the inputs to a call, and does everything that precedes the kernel.
-        compare: returns the difference of two outputs.
+        prepare: does everything that precedes the kernel, and returns a function that calls the
+            kernel on the given inputs.
+        compare: returns the difference between the golden output and another one.
         tolerance: description of the differences that `compare` treats as unnoticeable.
         repeatable: true if the call leaves no state behind, so that extra calls can warm it up.
         too_long: true if the kernel is too long to be stepped whole; windows are sampled.
@@ -347,14 +354,15 @@ class Kernel:
 
     @property
     def hang_s(self) -> float:
-        """CPU time, beyond a multiple of the golden run's, after which a run counts as hung, s.
+        """CPU time, in seconds, added to a multiple of the golden run's: the limit of a run.
 
+        A run that uses more counts as hung.
         A runaway allocation fills the memory in a third of this time, so it crashes first.
         """
         return self.memory_mb / _FILLED_MB_PER_S
 
     def scope(self) -> KernelScope:
-        """Return the machine code in scope. The kernel must have run in this process."""
+        """Find the kernel's entry and code in scope. The kernel must have run in this process."""
         from mavfi_cli.attack.kernels.scope import compiled_scope, kernel_scope
 
         scope = kernel_scope(self.name) if self.code is None else self.code()
@@ -366,7 +374,7 @@ def _point_cloud(inputs: KernelInputs) -> Call:
     params = point_cloud.PointCloudParams()
 
     def call() -> Output:
-        """Convert one depth frame to points, ENU, m."""
+        """Convert one depth frame to points in the ENU frame, in metres."""
         cloud = point_cloud.generate(inputs.frame, params)
         return {"points_enu_m": cloud.points_enu_m, "origin_enu_m": cloud.origin_enu_m}
 
@@ -379,7 +387,7 @@ def _octomap(inputs: KernelInputs) -> Call:
         world.insert(cloud)
 
     def call() -> Output:
-        """Insert one more cloud into the map; return the planner's map and the whole tree."""
+        """Insert one more cloud into the map, and return the planner's map and the whole tree."""
         world.insert(inputs.cloud)
         payload = np.frombuffer(world.snapshot().payload, np.uint8)
         return {"payload": payload, "tree": lambda: np.frombuffer(world.tree(), np.uint8)}
@@ -416,14 +424,14 @@ def _collision_check(inputs: KernelInputs) -> Call:
 
 def _planner(name: str) -> Callable[[KernelInputs], Call]:
     def prepare(inputs: KernelInputs) -> Call:
-        """Set up the problem of the recorded task, and return the planner's call on it."""
+        """Set up the planning problem of the recorded task, and return a call that solves it."""
         task, planner = inputs.task, planners.find(name)
         problem = PlanningProblem.pose(
             task.snapshot, task.start_enu_m, task.goal_enu_m, task.bounds_enu_m, PlanningParams()
         )
 
         def call() -> Output:
-            """Search once; return the path (n, 3), ENU, m."""
+            """Search once, and return the path: (n, 3) vertices in the ENU frame, in metres."""
             result = planner.plan(problem, task.seed)
             return {"found": np.array(result.found), "path_enu_m": result.path_enu_m}
 
@@ -434,7 +442,7 @@ def _planner(name: str) -> Callable[[KernelInputs], Call]:
 
 def _control(inputs: KernelInputs) -> Call:
     def call() -> Output:
-        """Run one control tick; return the command and the integral part of its PID."""
+        """Run one control tick, and return the command and the integral part of the PID."""
         state, command = tracking.step(
             inputs.tracking_state, inputs.tracking, inputs.tracking_params
         )
@@ -490,11 +498,11 @@ KERNELS = {
 
 @functools.cache
 def find(name: str) -> Kernel:
-    """Return a kernel by its name, or the `KERNEL` that a user's Python file defines.
+    """Return the built-in kernel `name`, or the `KERNEL` of the user's Python file at that path.
 
     Raises:
-        UnknownName: there is no such kernel.
-        TargetError: the file has no kernel.
+        UnknownName: no built-in kernel has this name.
+        TargetError: the file is missing, cannot be loaded or defines no kernel.
     """
     if name.endswith(".py"):
         return _own(Path(name))
@@ -517,17 +525,17 @@ def _own(path: Path) -> Kernel:
         raise TargetError(str(path), f"cannot be loaded: {error!r}") from None
     kernel = getattr(module, "KERNEL", None)
     if not isinstance(kernel, Kernel):
-        raise TargetError(str(path), "defines no Kernel named KERNEL")
+        raise TargetError(str(path), "must define a Kernel named KERNEL")
     return kernel
 
 
 def select(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names and files of the chosen kernels; without names, all built-in ones.
+    """Return the names of the chosen built-in kernels, then the paths of the user's kernel files.
 
-    Built-in kernels come first, in the order of the pipeline.
+    The built-in kernels are in the order of the pipeline. If `names` is empty, all are returned.
 
     Raises:
-        UnknownName: no kernel has one of the names.
+        UnknownName: no built-in kernel has one of the names.
         TargetError: a file has no kernel, or several kernels share a name.
     """
     chosen = list(names)
@@ -540,5 +548,5 @@ def select(names: Iterable[str]) -> tuple[str, ...]:
     ordered = (*(name for name in KERNELS if name in wanted), *dict.fromkeys(files))
     for name, count in Counter(find(kernel).name for kernel in ordered).items():
         if count > 1:
-            raise TargetError(name, "several kernels have this name")
+            raise TargetError(name, "more than one of the selected kernels has this name")
     return ordered

@@ -32,7 +32,7 @@ class PlanningTask:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelInputs:
-    """One input and state per kernel, each recorded at one invocation in a golden run."""
+    """The input and state of each kernel, recorded at one of its invocations in a golden run."""
 
     flight: str  # description of the flight
     frame: DepthFrame
@@ -51,7 +51,7 @@ class _Stored:
 
 
 def save_inputs(path: Path, inputs: Sequence[KernelInputs]) -> str:
-    """Write the inputs; return the SHA-256 of the file.
+    """Write the inputs to a file, and return the file's SHA-256.
 
     Raises:
         RecordError: the file cannot be written.
@@ -62,7 +62,7 @@ def save_inputs(path: Path, inputs: Sequence[KernelInputs]) -> str:
 
 
 def load_inputs(path: Path) -> tuple[tuple[KernelInputs, ...], str]:
-    """Read inputs that `save_inputs` wrote, and the SHA-256 of the file.
+    """Read a file that `save_inputs` wrote, and return its inputs and its SHA-256.
 
     Raises:
         RecordError: the file is missing or not a file of kernel inputs.
@@ -76,7 +76,11 @@ def load_inputs(path: Path) -> tuple[tuple[KernelInputs, ...], str]:
 
 
 def read_inputs(path: Path) -> bytes:
-    """Read the bytes of a file of inputs. Raises RecordError."""
+    """Return the bytes of a file of kernel inputs.
+
+    Raises:
+        RecordError: the file cannot be read or is too large.
+    """
     return read_bounded(path, _LARGEST)
 
 
@@ -88,5 +92,5 @@ def inputs_of_bytes(data: bytes) -> tuple[KernelInputs, ...]:
     """
     inputs = unpack(data, _Stored).inputs
     if not inputs:
-        raise ValueError("it holds no inputs")
+        raise ValueError("it contains no inputs")
     return inputs

@@ -87,7 +87,7 @@ def kernel_scope(kernel: str) -> KernelScope:
     """Find the entry and the scope of a kernel in this process.
 
     Raises:
-        UnknownName: no such kernel; the message suggests the nearest.
+        UnknownName: the kernel does not exist; the message suggests the nearest.
         FaultError: the kernel has not run in this process yet.
     """
     if kernel not in KERNELS:
@@ -100,10 +100,11 @@ def kernel_scope(kernel: str) -> KernelScope:
 
 
 def library_scope(library: str, function: str) -> KernelScope:
-    """Find the entry of a library's function. All code of the library is in scope.
+    """Return a scope whose entry is a library's function, with all code of the library in scope.
 
     Raises:
-        UnknownName: no such library or function; the message suggests the nearest.
+        UnknownName: this process has not loaded the library, or the library has no such function;
+            the message suggests the nearest name.
     """
     entry = Image(os.getpid()).function(function, [library])
     return KernelScope(kernel=function, entry=entry, objects=(library,), regions={})
@@ -117,14 +118,14 @@ def compiled_scope(kernel: str, function: Any) -> KernelScope:
 
     Args:
         kernel: Name of the kernel.
-        function: Compiled with `core.compiled.compiled`.
+        function: The function, compiled with `core.compiled.compiled`.
 
     Raises:
         FaultError: The function has not run yet.
     """
     overloads = list(getattr(function, "overloads", {}).items())
     if not overloads:
-        raise FaultError(f"{function} has not run yet: it has no machine code")
+        raise FaultError(f"{function} has no machine code, because it has not run in this process")
     signature, result = overloads[0]
     wrapper = result.fndesc.llvm_cpython_wrapper_name
     address = int(result.library.get_pointer_to_function(wrapper))
@@ -135,15 +136,15 @@ def compiled_scope(kernel: str, function: Any) -> KernelScope:
 
 
 def node_scope(node: str, planner: str) -> KernelScope:
-    """Find the entry and the scope of a mission node's work in this process.
+    """Find the entry and the code in scope of a mission node that runs in this process.
 
     A planner node first reads the map and builds its obstacle grid; neither step is in scope. All
     later work up to the reply is in scope: the tests of straight segments and of pieces of the
     trajectory, and the search if there is one.
 
     Raises:
-        UnknownName: no such node or planner; the message suggests the nearest.
-        FaultError: its kernel has not run in this process yet.
+        UnknownName: the node or planner does not exist; the message suggests the nearest.
+        FaultError: the node's kernel has not run in this process yet.
     """
     kernel = kernel_of_node(node, planner)
     scope = kernel_scope(kernel)
@@ -167,7 +168,11 @@ def _whole_request(search: KernelScope) -> KernelScope:
 
 
 def kernel_of_node(node: str, planner: str) -> str:
-    """Return the kernel that a node runs, given the mission's planner."""
+    """Return the kernel that a node runs, given the mission's planner.
+
+    Raises:
+        UnknownName: instruction-level faults cannot strike this planner.
+    """
     if node != "planner":
         return node
     name = canonical_planner(planner)
@@ -236,7 +241,7 @@ def _planner(kernel: str) -> KernelScope:
 
 
 def _nearest(image: Image, library: str, motion: str) -> tuple[Location, ...]:
-    """Return the nearest-neighbour searches that a planner's tree may call."""
+    """Return the entries of the nearest-neighbour searches that a planner's tree may call."""
     return tuple(
         Location(library, function.start)
         for function in _functions_with(image, library, motion)
@@ -247,7 +252,7 @@ def _nearest(image: Image, library: str, motion: str) -> tuple[Location, ...]:
 
 
 def _functions_with(image: Image, library: str, *parts: str) -> list[Function]:
-    """Return the functions of a library whose names contain one of the texts."""
+    """Return the functions of a library whose names contain at least one of `parts`."""
     named = image.named(library).functions
     return [function for function in named if any(part in function.name for part in parts)]
 
@@ -256,11 +261,11 @@ def _object_of(image: Image, prefix: str, folder: str = "") -> str:
     for name in image.names:
         if name.startswith(prefix) and folder in image.path_of(name):
             return name
-    raise FaultError(f"{prefix} is not loaded: the kernel must run once before its scope is known")
+    raise FaultError(f"{prefix} is not loaded yet: run the kernel once before asking for its scope")
 
 
 def _part(functions: Iterable[Function]) -> Part:
-    """Return the code of functions, including gaps of less than a page between them."""
+    """Return the code of the functions, including any gap of less than a page between two."""
     spans: list[range] = []
     for function in functions:
         start, end = function.start, function.start + function.size
@@ -272,7 +277,11 @@ def _part(functions: Iterable[Function]) -> Part:
 
 
 def _object_region(dispatcher: Any, signature: Any, wrapper: str, address: int) -> Region:
-    """Return the text of the compiled object, or the whole mapping if it is not cached."""
+    """Return the code of a function that numba has compiled.
+
+    If numba's cache has the compiled object, it is that object's text. Otherwise it is the whole
+    executable mapping that contains `address`.
+    """
     code = _cached_object(dispatcher, signature)
     if code is not None:
         elf: Any = ELFFile(io.BytesIO(code))
@@ -288,7 +297,7 @@ def _object_region(dispatcher: Any, signature: Any, wrapper: str, address: int) 
 
 
 def _cached_object(dispatcher: Any, signature: Any) -> bytes | None:
-    """Return the loaded relocatable object from numba's cache; None if it is not there."""
+    """Return a function's relocatable object from numba's cache, or None if it is not cached."""
     cache = getattr(dispatcher, "_cache", None)
     try:
         key = cache._index_key(signature, dispatcher.targetctx.codegen())  # type: ignore[union-attr]

@@ -38,7 +38,7 @@ _PROGRAM = "mavfi_cli.attack.kernels.template"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelTarget:
-    """A kernel and its inputs.
+    """A kernel to attack, and its inputs.
 
     Attributes:
         kernel: name of a built-in kernel, or the file of a user's kernel.
@@ -60,11 +60,11 @@ class KernelTarget:
 
     @property
     def stream(self) -> tuple[str, ...]:
-        """Name of the kernel's random stream: its faults do not depend on other kernels."""
+        """Name of the kernel's random stream, so that its faults do not depend on other kernels."""
         return (self.name,)
 
     def settings(self) -> Json:
-        """Return everything that determines the results."""
+        """Return all settings that determine the results of the kernel's runs."""
         return {
             "inputs_sha256": self.inputs_sha256,
             "flight": self.flight,
@@ -122,18 +122,18 @@ class _KernelPlace:
         return scope
 
     def start(self) -> Tracee:
-        """Start a run, attached and stopped before it calls the kernel.
+        """Fork the template for one run, and stop the fork before it calls the kernel.
 
         Raises:
-            TracingForbidden: the operating system refuses.
-            FaultError: the template process has died.
+            TracingForbidden: the operating system does not allow tracing.
+            FaultError: the template process has ended.
         """
         control = self._template.connection
         os.ftruncate(self._output, 0)
         control.send(RUN + bytes([self._number]))
         packet = control.recv(PID_BYTES)
         if len(packet) < PID_BYTES:
-            raise FaultError(f"the template process of {self.name} has died")
+            raise FaultError(f"the template process of {self.name} ended unexpectedly")
         tracee = Tracee.attach(int.from_bytes(packet, "little"), mechanism=self._target.mechanism)
         control.send(GO)
         return tracee
@@ -151,7 +151,7 @@ class _KernelPlace:
     def profile(
         self, rng: np.random.Generator, *, windows: int, watch: Watch | None = None
     ) -> TargetProfile:
-        """Step a golden run of the kernel, or a sample of it if it is too long.
+        """Step a golden run of the kernel, or a sample of its windows if the kernel is too long.
 
         The windows are divided among the inputs, because each input is one part of the campaign.
 
@@ -171,7 +171,7 @@ class _KernelPlace:
         )
 
     def fault_free(self) -> Golden:
-        """Run once without a fault.
+        """Run the kernel once without a fault.
 
         Raises:
             TargetError: the run fails.
@@ -188,7 +188,10 @@ class _KernelPlace:
         return "" if golden.output == again.output else "their outputs differ"
 
     def left(self) -> Golden | None:
-        """Read the last run's times and its output or error text; None if they are incomplete."""
+        """Return the times of the last run, and its output or the text of its error.
+
+        Returns None if they are incomplete.
+        """
         data = os.pread(self._output, os.fstat(self._output).st_size, 0)
         if len(data) < TIMES.size:
             return None

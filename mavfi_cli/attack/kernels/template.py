@@ -68,18 +68,21 @@ def main() -> None:
 
 
 def _give_up(why: str) -> NoReturn:
-    """Exit without the libraries' own final messages, which would hide this one."""
+    """Print the reason and exit, without the libraries' own final messages, which would hide it."""
     os.write(2, f"{why}\n".encode())
     os._exit(1)
 
 
 def _in_child(work: Callable[[], int]) -> int:
-    """Do work in a fork of this process; return its wait status when it has ended."""
+    """Call `work` in a fork of this process, wait for the fork, and return its wait status."""
     return os.waitpid(fork(work, exact=True), 0)[1]
 
 
 def _limit(extra_mb: int) -> None:
-    """Ignore SIGINT and SIGTERM; limit memory and file sizes in case a size is corrupted."""
+    """Ignore SIGINT and SIGTERM, and limit the size of memory and files.
+
+    The limits, such as `extra_mb` of additional memory, matter if a fault corrupts a size.
+    """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
@@ -90,7 +93,10 @@ def _limit(extra_mb: int) -> None:
 
 
 def _send_scope(connection: socket.socket, kernel: catalogue.Kernel, call: Call) -> int:
-    """Send the kernel's scope. Runs in a child, because finding the scope alters its memory."""
+    """Send the kernel's scope, and return 0.
+
+    This runs in a child process, because finding the scope alters memory.
+    """
     try:
         call()
         send(connection, kernel.scope())
@@ -104,7 +110,7 @@ def _describe(error: Exception) -> str:
 
 
 def _run(connection: socket.socket, call: Call) -> int:
-    """Run the kernel once; return the exit code."""
+    """Wait for `GO`, call the kernel once, write its output, and return the exit code."""
     connection.send(os.getpid().to_bytes(PID_BYTES, "little"))
     if not connection.recv(1):
         return 0

@@ -43,7 +43,7 @@ _FIXED = frozenset(("syscall", "sysenter", "int", "int3", "hlt", "ud2", "xbegin"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _DetourCode:
-    """The bytes of a detour."""
+    """The bytes of a detour, and where it stops."""
 
     jumps: dict[int, bytes]  # by address, in the code of the program
     pages: dict[int, bytes]  # by address
@@ -78,15 +78,16 @@ class Detour:
 
     @classmethod
     def at(cls, address: int, code_at: CodeAt, executions: Executions) -> Detour | None:
-        """Return the detour at one instruction; None if none fits."""
+        """Return the detour at the instruction at `address`, or None if no detour fits there."""
         size = _straight_bytes(address, code_at, executions)
         return cls(size) if size >= _JUMP_BYTES else None
 
     def code(self, code: bytes, address: int, pages: int, count: int) -> _DetourCode | None:
-        """Assemble the detour that stops before execution `count` of the instruction at `address`.
+        """Assemble the detour that stops the program before execution `count` of an instruction.
 
         Args:
             code: the replaced instructions; only the last may be a branch.
+            address: address of the counted instruction.
             pages: address of two pages of memory, less than 2 GB away.
 
         Returns:
@@ -128,7 +129,7 @@ class Detour:
 
 @dataclass(frozen=True, slots=True)
 class CountedStop:
-    """Run until `location` is about to execute for the `count`-th time since the previous stage."""
+    """A stop before `location` executes for the `count`-th time since the previous stage."""
 
     location: Location
     count: int
@@ -150,7 +151,7 @@ class _Flow:
 
 @functools.lru_cache(maxsize=65536)
 def _flow(code: bytes, address: int) -> _Flow | None:
-    """Decode the control flow of one instruction; None if the bytes are not an instruction."""
+    """Return the control flow of the instruction in `code`, or None if `code` is no instruction."""
     decoded = next(engine.disasm(code[:16], address, 1), None)
     if decoded is None:
         return None
@@ -173,7 +174,10 @@ def _jump(target: int, at: int) -> bytes:
 
 
 def _moved(decoded: Any, at: int, return_slot: int) -> bytes | None:
-    """Return the instruction relocated to another address; None if it cannot be relocated."""
+    """Return the instruction's bytes at its new address `at`, or None if it cannot be moved.
+
+    `return_slot` is the address at which a moved call finds its return address.
+    """
     raw = bytes(decoded.bytes)
     if decoded.mnemonic in _FIXED:
         return None
@@ -224,7 +228,7 @@ class CountedRun:
 
     @classmethod
     def of(cls, executions: Mapping[int, int], code_at: CodeAt) -> CountedRun:
-        """Make the population from execution counts by address."""
+        """Create a run from the execution counts of its instructions, keyed by address."""
         addresses = sorted(executions)
         flows = [_flow(code_at(address), address) for address in addresses]
         counts = _without_repeats(addresses, [executions[address] for address in addresses], flows)
@@ -241,7 +245,10 @@ class CountedRun:
         )
 
     def without(self, methods: Container[Counting]) -> CountedRun:
-        """Return the same run without some counting methods; fewer executions can be reached."""
+        """Return the same run without the counting methods in `methods`.
+
+        Fewer executions can then be reached.
+        """
         detours = [
             None if detour and detour.counting in methods else detour for detour in self.detours
         ]
@@ -250,7 +257,10 @@ class CountedRun:
 
     @functools.cached_property
     def reached(self) -> NDArray[np.int64]:
-        """Number of reachable executions of each instruction, from the first one on, (n,)."""
+        """Number of reachable executions of each instruction, as an array of shape (n,).
+
+        They are the first executions of the instruction.
+        """
         detoured = np.array([self.detours[place] is not None for place in self.places])
         return np.where(detoured, self.counts, np.minimum(self.counts, _BY_BREAKPOINT))
 
@@ -269,23 +279,26 @@ class CountedRun:
         return 1.0 - self.executed / max(1, int(self.counts.sum()))
 
     def _at(self, position: int) -> tuple[int, int]:
-        """Return the index of one executed instruction, and its execution number, from 1."""
+        """Return the index of the instruction at `position`, and its execution number, from 1."""
         index = int(np.searchsorted(self._ends, position, side="right"))
         return index, position - int(self._ends[index] - self.reached[index]) + 1
 
     def address(self, position: int) -> int:
-        """Return the address of one executed instruction."""
+        """Return the address of the executed instruction at `position`, from 0."""
         return int(self.addresses[self._at(position)[0]])
 
     def trigger(
         self, position: int, locate: Locate, _: CodeAt
     ) -> tuple[tuple[CountedStop, ...], int]:
-        """Return the trigger for one executed instruction, and its execution number k."""
+        """Return the trigger for the executed instruction at `position`, and its number k.
+
+        The number is that of the execution, from 1.
+        """
         index, k = self._at(position)
         return self.stages(index, k, locate), k
 
     def stages(self, index: int, k: int, locate: Locate) -> tuple[CountedStop, ...]:
-        """Return the stages of a trigger that stops before execution k of an instruction."""
+        """Return the stages of a trigger that stops before execution `k` of instruction `index`."""
         place = int(self.places[index])
         here, there = (locate(int(self.addresses[at])) for at in (index, place))
         detour = self.detours[place]
@@ -297,7 +310,7 @@ class CountedRun:
 
 
 def _straight_bytes(address: int, code_at: CodeAt, executions: Executions) -> int:
-    """Return the number of bytes, from one instruction on, that a detour may replace."""
+    """Return the number of bytes from `address` on that a detour may replace."""
     size, expected = 0, None
     while (how := _flow(code_at(address + size), address + size)) is not None and how.movable:
         size += how.size
@@ -312,7 +325,10 @@ def _straight_bytes(address: int, code_at: CodeAt, executions: Executions) -> in
 def _without_repeats(
     addresses: list[int], counts: list[int], flows: list[_Flow | None]
 ) -> list[int]:
-    """Count each execution of a repeated string instruction once, not once per iteration."""
+    """Return the counts, with a repeated string instruction counted once per execution.
+
+    In `counts`, it is counted once per iteration.
+    """
     counts = list(counts)
     for at, how in enumerate(flows):
         if how is None or not how.repeated or at + 1 == len(addresses):
@@ -323,7 +339,7 @@ def _without_repeats(
 
 
 def _joined(addresses: list[int], counts: list[int], flows: list[_Flow | None]) -> list[bool]:
-    """Return flags (n,): True if an instruction is the only predecessor of the next."""
+    """Return, for each instruction, whether it and the next one always execute together."""
     joined = [
         how is not None
         and how.straight
@@ -337,7 +353,7 @@ def _joined(addresses: list[int], counts: list[int], flows: list[_Flow | None]) 
 def _detours(
     addresses: list[int], sizes: list[int], flows: list[_Flow | None]
 ) -> Iterator[Detour | None]:
-    """Yield the detour at each instruction; None if none fits."""
+    """Yield, for each instruction, a detour that can count it, or None if no detour fits."""
     ends = [at + how.size if how else at for at, how in zip(addresses, flows, strict=True)]
     gaps = [
         range(end, start - _JUMP_BYTES + 1)
@@ -358,7 +374,7 @@ def _detours(
 
 
 def _over_gap(address: int, size: int, gaps: Sequence[range], near: range) -> Detour | None:
-    """Return a detour through the first unused bytes in reach; None if there are none."""
+    """Return a detour through the first unused bytes in reach, or None if none are in reach."""
     for gap in gaps:
         first = max(gap.start, near.start)
         if first >= near.stop:
@@ -369,7 +385,10 @@ def _over_gap(address: int, size: int, gaps: Sequence[range], near: range) -> De
 
 
 def _places(detours: Sequence[Detour | None], joined: Sequence[bool]) -> list[int]:
-    """Return, for each instruction, the index where it is counted: its own or one in its block."""
+    """Return, for each instruction, the index of the one that is counted: itself or a neighbour.
+
+    The neighbour is in the same block, so it executes equally often.
+    """
     places: list[int] = []
     start = 0
     for at, more in enumerate(joined):

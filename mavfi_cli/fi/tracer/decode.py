@@ -68,12 +68,15 @@ class MemoryUse:
 
     @property
     def operand(self) -> str:
-        """Describe the operand for a record."""
+        """The operand in words, for a record."""
         parts = [part for part in (self.segment, self.base, self.index) if part]
         return f"{self.size} bytes at {'+'.join(parts)}{self.displacement:+#x}"
 
     def address(self, instruction: Instruction, read: Callable[[str], int]) -> int:
-        """Return the address before the instruction executes; `read` returns a register's value."""
+        """Return the address of the memory, given the registers before the instruction executes.
+
+        `read` returns the value of a full register, given its name.
+        """
 
         def value(name: str | None) -> int:
             named = _GENERAL.get(name or "")
@@ -108,7 +111,10 @@ class Instruction:
 
 @functools.lru_cache(maxsize=65536)
 def decode(code: bytes, address: int) -> Instruction | None:
-    """Decode one instruction from 16 bytes; None if the bytes are not an instruction."""
+    """Decode the instruction at the start of `code`, 16 bytes that begin at `address`.
+
+    Returns None if the bytes are not an instruction.
+    """
     decoded = next(engine.disasm(code, address, 1), None)
     if decoded is None:
         return None
@@ -145,7 +151,7 @@ _INTEGERS = re.compile(r"v?p\w*s[ds]$")  # of signed doublewords: pmaxsd, pabsd
 
 
 def _elements(mnemonic: str) -> tuple[str | None, str | None]:
-    """Return the float types that an instruction reads and writes."""
+    """Return the float types that an instruction reads and writes, or None for other types."""
     if match := _CONVERSION.match(mnemonic):
         return _FLOATS.get(match[1]), _FLOATS.get(match[2])
     element = None if _INTEGERS.match(mnemonic) else _FLOATS.get(mnemonic[-2:])
@@ -233,9 +239,10 @@ _GENERAL = _general_names()
 
 @functools.cache
 def _named(name: str) -> _Named | None:
-    """Return the register with this name; None for flags, segments and control words.
+    """Return the part of a full register that a name denotes.
 
-    A vector register gets its 512-bit name on every processor, so that records agree.
+    Returns None for flags, segments and control words. A vector register gets its 512-bit name on
+    every processor, so that records agree.
     """
     if name in _GENERAL:
         return _GENERAL[name]
@@ -255,7 +262,7 @@ class _Operands:
     explicit: tuple[Touched, ...] = ()  # one per operand that the assembler names
 
     def touch(self, name: str, bits: Touched, *, explicit: bool = False) -> None:
-        """Add bits of a register, counted from the lowest bit of the named part."""
+        """Add bits that are read or written, counted from the lowest bit of the register `name`."""
         named = _named(name)
         if named is None:
             return
@@ -287,7 +294,7 @@ class _Operands:
 
 
 def _operands_of(decoded: Any) -> _Operands:
-    """Return what a decoded instruction reads and writes."""
+    """Return the operands that a decoded instruction reads and writes."""
     vector = vector_bits(decoded)
     all_of = _Operands(explicit=_bits(decoded) if vector is None else vector)
     for op, bits in zip(decoded.operands, all_of.explicit, strict=True):

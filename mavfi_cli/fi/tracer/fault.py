@@ -72,7 +72,7 @@ class InstructionCorruption:
     inverts: str = ""  # a conditional jump: flip only the bits that invert its decision
 
     def struck(self, flags: int) -> tuple[int, ...]:
-        """Return the bits to invert; `flags`, the flags register, matters only to invert a jump.
+        """Return the bits to invert. The flags register, `flags`, matters only to invert a jump.
 
         Such a jump tests two conditions: "below" or "less", and "equal". Each one that holds is
         negated. If neither holds, "equal" is made to hold.
@@ -88,7 +88,7 @@ class InstructionCorruption:
         return tuple(sorted([less] * below + [zero] * equal))
 
     def to_json(self) -> Json:
-        """Return the corruption part of a record."""
+        """Return the corruption as an entry of a record."""
         names = {"site": self.site.value, "role": self.role.value, "bits": list(self.bits)}
         values = asdict(self) | names
         return values if self.inverts else {k: v for k, v in values.items() if k != "inverts"}
@@ -96,7 +96,7 @@ class InstructionCorruption:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InstructionFault:
-    """One fault. The last stage of its trigger stops at the attacked instruction."""
+    """One instruction-level fault. Its trigger's last stage stops at the attacked instruction."""
 
     trigger: tuple[CountedStop, ...]
     execution: int  # k: number of the execution in the profiled scope, from 1
@@ -124,10 +124,12 @@ class FaultModel:
     def named(
         cls, *, sites: Iterable[str], roles: Iterable[str], field: str, bits: int
     ) -> FaultModel:
-        """Make a model from names. No sites means all data registers, no roles means both.
+        """Create a model from the names of sites and roles, a field and a number of bits.
+
+        Empty `sites` stand for all data registers, and empty `roles` for both roles.
 
         Raises:
-            UnknownName: a name does not exist; the message suggests the nearest.
+            UnknownName: a site, role or field does not exist; the message suggests the nearest.
         """
         default = cls()
         return cls(
@@ -240,7 +242,7 @@ def _control(instruction: Instruction, model: FaultModel) -> list[_Operand]:
 
 
 def _site_of(register: str) -> Site:
-    """Return the site of a full register."""
+    """Return the site to which a full register belongs."""
     return _SITES.get(register.rstrip("0123456789"), Site.GENERAL)
 
 
@@ -286,7 +288,8 @@ class Strategy:
         """Return the strategy of a sampling rule or of an emulated injector.
 
         Raises:
-            UnknownName: no such rule or compatibility mode; the message suggests the nearest.
+            UnknownName: the rule or compatibility mode does not exist; the message suggests the
+                nearest.
             FaultSpecError: a model is given for an emulated injector, which has its own.
         """
         if compat is not None:
@@ -306,7 +309,10 @@ class Strategy:
         rng: np.random.Generator,
         following: Instruction | None = None,
     ) -> InstructionCorruption | None:
-        """Draw a corruption of an instruction; None if none fits. `following` is the next one."""
+        """Draw a corruption of `instruction`, or return None if it has no suitable operand.
+
+        `following` is the instruction after it, which some emulated injectors consider.
+        """
         if self.imitates is not None:
             return self.imitates(instruction, following, rng)
         return _draw_corruption(instruction, self.model, rng)

@@ -62,7 +62,7 @@ class _ElfFacts:
             raise FaultError(f"{self.path}: not a readable ELF object ({error})") from None
 
     def function_at(self, address: int) -> Function | None:
-        """Return the function that holds a linked address.
+        """Return the function that contains a linked address, or None if no function does.
 
         If several start at the same address, the largest is returned; among equally large ones, the
         last by name. A function without a size extends to the next one.
@@ -76,7 +76,9 @@ class _ElfFacts:
 
 @functools.lru_cache(maxsize=256)
 def _elf_facts(path: str, _modified_ns: int) -> _ElfFacts:
-    """Read an ELF file; the hash of its contents replaces a missing build id.
+    """Read the build id, the code and the first address of an ELF file.
+
+    A hash of the file's contents replaces a missing build id.
 
     Raises:
         FaultError: the file cannot be read or is not an ELF file.
@@ -114,7 +116,7 @@ def _text(elf: Any) -> tuple[range, ...]:
 
 
 def _functions(elf: Any) -> Iterator[Function]:
-    """Yield the functions in both symbol tables."""
+    """Yield the functions that the symbol tables of an ELF file list."""
     for table in (".symtab", ".dynsym"):
         section = elf.get_section_by_name(table)
         if section is None or not section["sh_size"]:
@@ -171,7 +173,7 @@ class _LoadedObject:
 
     @property
     def path(self) -> str | None:
-        """Path of its file; None for a region."""
+        """Path of the object's file, or None for a region."""
         return None if self.facts is None else self.facts.path
 
     @property
@@ -207,7 +209,7 @@ class Scope:
 
     @property
     def bounds(self) -> NDArray[np.int64]:
-        """The start and end of each span, (n, 2)."""
+        """The start and end of each span, as an array of shape (n, 2)."""
         return np.array([[span.start, span.stop] for span in self.spans], np.int64)
 
 
@@ -215,10 +217,10 @@ Regions = Mapping[str, "range | Region | Part"]
 
 
 class Image:
-    """The objects of one process at one moment."""
+    """The objects and regions of code that one process has loaded, as of one moment."""
 
     def __init__(self, pid: int, regions: Regions | None = None) -> None:
-        """Read the maps of a process.
+        """Read the memory maps of a process.
 
         Args:
             regions: maps a name to the addresses of compiled code without a file, or to the part of
@@ -256,11 +258,11 @@ class Image:
         return [*self._loaded, *(name for name in self._paths if name not in self._loaded)]
 
     def path_of(self, name: str) -> str:
-        """Path of a mapped file; empty for a region."""
+        """Return the path of a mapped file, or an empty string for a region."""
         return self._paths.get(name, "")
 
     def find(self, name: str) -> _LoadedObject | None:
-        """Return an object or region by its name; None if no such object is loaded.
+        """Return the object or region with this name, or None if it is not loaded.
 
         An object is read on first use, because a Python process loads hundreds of them.
         """
@@ -270,14 +272,14 @@ class Image:
         return self._loaded[name]
 
     def object_at(self, address: int) -> _LoadedObject | None:
-        """Return the object that holds an address."""
+        """Return the object or region that contains an address, or None if none does."""
         index = bisect.bisect_right(self._starts, address) - 1
         if index < 0 or address >= self._sorted[index][1]:
             return None
         return self.find(self._sorted[index][2])
 
     def named(self, name: str) -> _LoadedObject:
-        """Return an object or region by its name.
+        """Return the object or region with this name.
 
         Raises:
             UnknownName: no such object is loaded.
@@ -288,7 +290,7 @@ class Image:
         return loaded
 
     def locate(self, address: int) -> Location:
-        """Return the location of an address; in unknown memory, its object is `?`."""
+        """Return the location of an address. If no object contains it, the object is `?`."""
         loaded = self.object_at(address)
         if loaded is None:
             return Location("?", address)
@@ -298,12 +300,12 @@ class Image:
         """Return the address of a location in this process.
 
         Raises:
-            UnknownName: its object is not loaded.
+            UnknownName: the location's object is not loaded.
         """
         return self.named(location.object).bias + location.offset
 
     def symbol(self, location: Location) -> str:
-        """Return `function+offset` for a location; empty if no function is known there."""
+        """Return a location as `function+offset`, or an empty string if its function is unknown."""
         loaded = self.find(location.object)
         if loaded is None or loaded.facts is None:
             return ""
@@ -325,7 +327,7 @@ class Image:
         raise UnknownName("function", name, known[:200])
 
     def scope(self, objects: Iterable[str]) -> Scope:
-        """Return the code of the named objects.
+        """Return a scope that contains the code of the named objects.
 
         Raises:
             UnknownName: an object is not loaded; the message suggests the nearest name.
@@ -347,7 +349,9 @@ def _mappings(pid: int) -> Iterator[_Mapping]:
 
 
 def executable_mapping(pid: int, address: int) -> range:
-    """Return the executable mapping that holds an address, such as a JIT-compiled kernel's.
+    """Return the range of the executable mapping that contains an address.
+
+    The address may be that of a just-in-time compiled kernel.
 
     Raises:
         FaultError: nothing executable is mapped there.
@@ -359,7 +363,7 @@ def executable_mapping(pid: int, address: int) -> range:
 
 
 def _load(path: str, mappings: list[_Mapping]) -> _LoadedObject | None:
-    """Return the object of a mapped file; None if it is not an ELF file."""
+    """Return the object of a mapped file, or None if it is not a readable ELF file."""
     if not Path(path).is_file():
         return None
     try:

@@ -17,7 +17,7 @@ from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
 
 class BitActivation(Enum):
-    """The fate of the corrupted bits within the followed window."""
+    """What happened to the corrupted bits while they were followed."""
 
     READ = "read"
     OVERWRITTEN = "overwritten"
@@ -41,7 +41,7 @@ class Injection:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Followed:
-    """The activation, and the instruction that decided it."""
+    """The activation of the corrupted bits, and the instruction that decided it."""
 
     activation: BitActivation
     after_instructions: int  # 0: the attacked instruction itself
@@ -65,7 +65,7 @@ def reach(tracee: Tracee, image: Image, fault: InstructionFault) -> str:
 
 
 def instruction_at(tracee: Tracee, address: int) -> Instruction | None:
-    """Decode the instruction at an address of the target; None if there is none."""
+    """Decode the instruction at an address of the target, or return None if there is none."""
     try:
         return decode(tracee.memory.read(address, 16), address)
     except OSError:
@@ -76,7 +76,7 @@ def clean_step(tracee: Tracee, instruction: Instruction | None) -> Ended | None:
     """Execute one whole instruction and leave no trap flag in the target.
 
     Returns:
-        How the program ended; None if it did not.
+        How the program ended, or None if it has not ended.
     """
     if instruction is not None and instruction.run_over:
         tracee.run_to(instruction.next_address)
@@ -105,7 +105,7 @@ def _erase_trap(tracee: Tracee, instruction: Instruction) -> None:
 def _apply(
     tracee: Tracee, instruction: Instruction, corruption: InstructionCorruption
 ) -> Injection:
-    """Invert the bits at the stop before `instruction`.
+    """Apply a corruption at the stop before `instruction`, and verify it.
 
     A destination is corrupted after the instruction has executed. The result is read back. A
     change that the operating system discards or refuses counts as not applied.
@@ -156,7 +156,10 @@ def _invert(
 def _execute_corrupted(
     tracee: Tracee, instruction: Instruction, corruption: InstructionCorruption
 ) -> tuple[int, int]:
-    """Emulate a transient fetch error: execute the corrupted bytes once, then restore the code."""
+    """Emulate a transient fetch error: execute the corrupted bytes once, then restore the code.
+
+    Returns the original and the corrupted bytes, each as a number.
+    """
     corrupted = bits.flip_bytes(instruction.raw, corruption.bits)
     tracee.memory.write(instruction.address, corrupted)
     seen = tracee.memory.read(instruction.address, len(corrupted))
@@ -217,12 +220,12 @@ def strike(
         patience_s: longest wall-clock time for which it is followed.
 
     Raises:
-        FaultError: another instruction is at the location.
+        FaultError: the location holds another instruction.
     """
     instruction = instruction_at(tracee, tracee.registers.ip)
     if instruction is None or instruction.raw != fault.instruction_bytes:
         text = "nothing" if instruction is None else instruction.text
-        raise FaultError(f"{fault.target} must hold {fault.instruction!r}, got {text!r}")
+        raise FaultError(f"{fault.target} must hold {fault.instruction!r}, but it holds {text!r}")
     if fault.corruption is None:
         return None, NOTHING
     injection = _apply(tracee, instruction, fault.corruption)
@@ -239,7 +242,10 @@ def _touch(
     place: int,
     remaining: int,
 ) -> tuple[bool, int]:
-    """Return whether an instruction reads remaining bits, and which bits remain after it."""
+    """Return whether `current` reads corrupted bits, and which of them remain after it.
+
+    `remaining` holds the corrupted bits that have not been overwritten yet.
+    """
     if corruption.site is Site.MEMORY:
         return _touch_memory(tracee, current, place, remaining)
     register = corruption.register

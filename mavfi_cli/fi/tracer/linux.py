@@ -71,7 +71,7 @@ def request(number: int, tid: int, address: int = 0, data: int = 0) -> int:
 
 
 def require_supported() -> None:
-    """Refuse to trace on an unsupported machine.
+    """Raise an error if instruction-level injection does not support this machine.
 
     Raises:
         TracingForbidden: this is not x86-64 Linux.
@@ -89,7 +89,7 @@ def seize(tid: int, *, kill_with_tracer: bool) -> None:
 
     Raises:
         TracingForbidden: the operating system refuses; the message explains how to allow it.
-        ProcessLookupError: no such thread.
+        ProcessLookupError: the thread does not exist.
     """
     require_supported()
     options = TRACE_OPTIONS | (OPTION_EXITKILL if kill_with_tracer else 0)
@@ -100,14 +100,17 @@ def seize(tid: int, *, kill_with_tracer: bool) -> None:
 
 
 def get_registers(tid: int, note: int, buffer: ctypes.Array[ctypes.c_char]) -> int:
-    """Fill `buffer` with a register set; return the number of bytes that the kernel wrote."""
+    """Fill `buffer` with the register set `note` of a stopped thread, and return its size in bytes.
+
+    The size is the number of bytes that the kernel wrote.
+    """
     vector = _IoVector(ctypes.addressof(buffer), len(buffer))
     request(GETREGSET, tid, note, ctypes.addressof(vector))
     return int(vector.length)
 
 
 def set_registers(tid: int, note: int, data: bytes) -> None:
-    """Write a register set.
+    """Write the register set `note` of a stopped thread.
 
     Raises:
         OSError: the kernel refuses a value (EINVAL, EIO).
@@ -118,9 +121,9 @@ def set_registers(tid: int, note: int, data: bytes) -> None:
 
 
 class Memory:
-    """The memory of a process, accessible whatever its protection; opened on first use.
+    """The memory of a process, which can be read and written whatever its protection.
 
-    Reading and writing raise OSError where nothing is mapped.
+    It is opened on first use. Reading and writing raise OSError where nothing is mapped.
     """
 
     def __init__(self, pid: int) -> None:
@@ -132,15 +135,15 @@ class Memory:
         return self._file
 
     def read(self, address: int, size: int) -> bytes:
-        """Return the bytes at an address."""
+        """Return `size` bytes at an address, or fewer if the mapped memory ends first."""
         return os.pread(self._open(), size, address)
 
     def write(self, address: int, data: bytes) -> None:
-        """Write bytes at an address; the kernel first copies a page that is privately mapped."""
+        """Write `data` at an address. The kernel first copies a page that is privately mapped."""
         os.pwrite(self._open(), data, address)
 
     def close(self) -> None:
-        """Close the file; the next use opens it again."""
+        """Close the memory. The next read or write opens it again."""
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
@@ -173,7 +176,7 @@ def share_processor(pid: int) -> None:
 
 
 def cpu_time_s(pid: int) -> float:
-    """Return the CPU time that all threads of a process have used, s; 0 once it has ended.
+    """Return the CPU time, in seconds, of all threads of a process, or 0 if it has ended.
 
     The clock id encoding is that of clock_getcpuclockid(3) on Linux.
     """
@@ -202,12 +205,12 @@ class Status:
 
     @property
     def signal(self) -> int:
-        """The signal of a stop."""
+        """Number of the signal at which the thread stopped."""
         return os.WSTOPSIG(self.raw)
 
     @property
     def event(self) -> int:
-        """The ptrace event of a stop, 0 for a signal-delivery stop."""
+        """Number of the ptrace event at which the thread stopped, or 0 for any other stop."""
         return self.raw >> 16
 
     @property
@@ -273,5 +276,5 @@ class ProcessTimer:
             self.fired = False  # the process has ended
 
     def _left_s(self) -> float:
-        """Return a lower bound on the remaining wall-clock time, s; 0 or less if it is over."""
+        """Return a lower bound on the remaining wall-clock time, in seconds. It may be negative."""
         return min((end_s - clock()) / rate for clock, end_s, rate in self._ends)

@@ -37,7 +37,7 @@ _WIDEST_OPERAND, _MOST_OPERANDS = 8192, 8  # bits of an opcode or in memory; mem
 def planned(
     fault: InstructionFault, image: Image, *, names_symbol: bool = True, **context: Any
 ) -> FaultRecord:
-    """Return the record of a fault before the flip.
+    """Return the record of a fault that has not struck yet.
 
     Args:
         image: image of the process, for symbols and build ids.
@@ -67,7 +67,10 @@ def planned(
 
 
 def undrawn(**context: Any) -> FaultRecord:
-    """Return the record of a fault that is drawn when it strikes. `context` as for `planned`."""
+    """Return the record of a fault that will be drawn only when it strikes.
+
+    `context` holds further entries, as for `planned`.
+    """
     record = {
         "version": VERSION,
         "state": "planned",
@@ -90,7 +93,10 @@ def _stage_to_json(stage: CountedStop) -> StageRecord:
 def completed(
     record: FaultRecord, injection: Injection | None, followed: Followed, **result: Any
 ) -> FaultRecord:
-    """Return the record after the run. `injection` is None for a null run or a missed trigger."""
+    """Return the record of a fault after its run, with the entries of `result` added.
+
+    `injection` is None for a null run, or if the trigger was not reached.
+    """
     what: Json = {"applied": False}
     if injection is not None:
         values = {"before": hex(injection.before), "after": hex(injection.after)}
@@ -101,7 +107,10 @@ def completed(
 
 
 def repeatable(written: FaultRecord) -> dict[str, Any]:
-    """Return a completed record with its final state, but without the duration of the stop."""
+    """Return a completed record in the form that every repetition of the run reproduces.
+
+    It has a final state (`applied`, `not_injected` or `null`), but not the duration of the stop.
+    """
     injection = {k: v for k, v in written["injection"].items() if k != "stop_s"}
     reason = written.get("not_injected_reason", "")
     state = "applied" if injection["applied"] else "not_injected"
@@ -138,7 +147,11 @@ class _Stage:
     detour: Detour | None = None
 
     def stop(self) -> CountedStop:
-        """Return the stage of the trigger. Raises ValueError if a number is out of its range."""
+        """Return the recorded stage as a counted stop.
+
+        Raises:
+            ValueError: a number is out of range.
+        """
         _require_range("offset", self.offset, 0, _LARGEST_OFFSET)
         _require_range("count", self.count, 1, _LARGEST_COUNT)
         if self.detour is not None:
@@ -163,7 +176,7 @@ class _Repeatable:
 
     @classmethod
     def of(cls, record: FaultRecord) -> _Repeatable:
-        """Read the entries.
+        """Read the entries of a record.
 
         Raises:
             RecordError: the record is damaged or has another version.
@@ -193,7 +206,7 @@ def _require_bits(corruption: InstructionCorruption) -> None:
         try:
             width = width_of(corruption.register)
         except KeyError:
-            raise ValueError(f"there is no register {corruption.register!r}") from None
+            raise ValueError(f"unknown register {corruption.register!r}") from None
     for bit in corruption.bits:
         _require_range("corruption.bits", bit, 0, width - 1)
     _require_range("corruption.memory_operand", corruption.memory_operand, 0, _MOST_OPERANDS - 1)
@@ -219,12 +232,12 @@ def fault_of(record: FaultRecord) -> InstructionFault:
 
 
 def require_same_build(record: FaultRecord, image: Image) -> None:
-    """Refuse a record whose objects differ from the loaded ones.
+    """Raise an error if an object that a record names is not loaded or is from another build.
 
     Raises:
         BuildMismatch: an object is missing or of another build; the message names all such
             objects.
-        RecordError: as `fault_of`.
+        RecordError: the record is damaged or has another version.
     """
     differences = []
     for name, build_id in _Repeatable.of(record).build_ids.items():
@@ -232,7 +245,7 @@ def require_same_build(record: FaultRecord, image: Image) -> None:
         if loaded is None:
             differences.append(f"{name} is not loaded")
         elif loaded.build_id != build_id:
-            differences.append(f"{name} has build id {loaded.build_id}, recorded is {build_id}")
+            differences.append(f"{name} has build id {loaded.build_id}, not {build_id} as recorded")
     if differences:
         raise BuildMismatch(differences)
 
@@ -247,10 +260,10 @@ def write(path: Path, record: FaultRecord) -> None:
 
 
 def read(path: Path) -> FaultRecord:
-    """Read a record.
+    """Read a fault record from a file.
 
     Raises:
-        RecordError: no such file, or it is not a fault record.
+        RecordError: the file does not exist or is not a fault record.
     """
     record = read_json(path, _LARGEST)
     if "trigger" not in record:

@@ -34,7 +34,7 @@ _CODE = bytes.fromhex(
 
 
 def _cpuid(leaf: int, subleaf: int) -> tuple[int, int, int, int]:
-    """Return EAX, EBX, ECX, EDX of one CPUID leaf."""
+    """Return the values of EAX, EBX, ECX and EDX after CPUID with this leaf and subleaf."""
     page = mmap.mmap(-1, 4096, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
     page.write(_CODE)
     start = ctypes.addressof(ctypes.c_char.from_buffer(page))
@@ -47,7 +47,10 @@ def _cpuid(leaf: int, subleaf: int) -> tuple[int, int, int, int]:
 
 @functools.lru_cache(maxsize=1)
 def _xsave_offsets() -> dict[int, int]:
-    """Return the byte offsets of XSAVE components 2 and above in the standard format."""
+    """Return the byte offset of each XSAVE component that the processor has, keyed by its number.
+
+    The offsets are those of the standard format. Components 0 and 1 are left out.
+    """
     low, _, _, high = _cpuid(0xD, 0)
     enabled = low | high << 32
     return {n: _cpuid(0xD, n)[1] for n in range(2, 63) if enabled >> n & 1}
@@ -90,7 +93,7 @@ def width_of(name: str) -> int:
     """Return the width of a full register in bits.
 
     Raises:
-        KeyError: no such register.
+        KeyError: the register does not exist.
     """
     if name in _SLOT:
         return 64
@@ -102,7 +105,10 @@ def width_of(name: str) -> int:
 
 
 def _vector_spans(kind: str, index: int) -> list[_Span]:
-    """Return where a vector register is stored, without parts that this processor lacks."""
+    """Return the spans of the XSAVE area that hold a vector register.
+
+    Parts that this processor lacks are left out.
+    """
     parts = {"xmm": 1, "ymm": 2, "zmm": 3}[kind]
     offsets = _xsave_offsets()
     if index >= 16:
@@ -117,7 +123,7 @@ def _vector_spans(kind: str, index: int) -> list[_Span]:
 
 
 class Registers:
-    """All registers of one stopped thread, read lazily and written through."""
+    """All registers of one stopped thread. They are read on first use and written at once."""
 
     __slots__ = ("_extended", "_general", "tid")
 
@@ -127,12 +133,12 @@ class Registers:
         self._extended: bytes | None = None
 
     def forget(self) -> None:
-        """Drop cached values; call after the thread has run."""
+        """Drop the cached values, which are out of date once the thread has run."""
         self._general = None
         self._extended = None
 
     def general(self) -> list[int]:
-        """Return `user_regs_struct` as 27 integers."""
+        """Return the general registers: `user_regs_struct`, as 27 integers."""
         if self._general is None:
             buffer = ctypes.create_string_buffer(216)
             linux.get_registers(self.tid, NT_PRSTATUS, buffer)
@@ -152,7 +158,7 @@ class Registers:
         """Return the value of a full register.
 
         Raises:
-            KeyError: no such register on this processor.
+            KeyError: this processor has no such register.
         """
         if name in _SLOT:
             return self.general()[_SLOT[name]]
@@ -182,7 +188,7 @@ class Registers:
         linux.set_registers(self.tid, NT_X86_XSTATE, bytes(area))
 
     def write_together(self, values: Mapping[str, int]) -> None:
-        """Write several general registers, by name, at once.
+        """Write several general registers at once, given their values by register name.
 
         Raises:
             OSError: the kernel refuses a value.
@@ -193,7 +199,7 @@ class Registers:
         self.write_general(words)
 
     def write_general(self, words: list[int]) -> None:
-        """Write `user_regs_struct` as 27 integers."""
+        """Write the general registers: `user_regs_struct`, as 27 integers."""
         data = bytes((ctypes.c_uint64 * 27)(*words))
         self.forget()
         linux.set_registers(self.tid, NT_PRSTATUS, data)
@@ -213,7 +219,7 @@ class Registers:
         return [_Span(OPMASK, _xsave_offsets()[OPMASK] + 8 * index, 8)]
 
     def rearm(self) -> None:
-        """Clear the resume flag, so that a breakpoint on the next instruction hits.
+        """Clear the resume flag, so that a breakpoint on the next instruction takes effect.
 
         A stop at an instruction breakpoint leaves this flag set, and the flag suppresses the
         breakpoint for the next instruction (Intel SDM volume 3, section 18.3.1.1).

@@ -43,7 +43,7 @@ class Segment:
 
     @functools.cached_property
     def ranks(self) -> NDArray[np.int64]:
-        """For each position, the execution number of its instruction, from 1, (n,)."""
+        """Execution number, from 1, of the instruction at each position; an array of shape (n,)."""
         order = np.argsort(self.trace, kind="stable")
         ordered = self.trace[order]
         fresh = np.r_[True, ordered[1:] != ordered[:-1]]
@@ -86,18 +86,24 @@ class Stratum:
         return len(self.segments) == self.windows_in_run
 
     def address(self, position: int) -> int:
-        """Return the address of one executed instruction; positions run through all segments."""
+        """Return the address of the executed instruction at `position`.
+
+        Positions count the executed instructions of all segments, from 0.
+        """
         segment, index = self._at(position)
         return int(segment.trace[index])
 
     def trigger(
         self, position: int, locate: Locate, code_at: CodeAt
     ) -> tuple[tuple[CountedStop, ...], int]:
-        """Return the trigger for one executed instruction, and its execution number k."""
+        """Return the trigger for the executed instruction at `position`, and its number k.
+
+        The number is that of the execution in its window, from 1. Positions are as for `address`.
+        """
         return _plan_trigger(*self._at(position), locate, code_at if self.detours else None)
 
     def _at(self, position: int) -> tuple[Segment, int]:
-        """Return the segment of a position, and its index there; see `address`."""
+        """Return the segment that contains a position, and the index in that segment."""
         for segment in self.segments:
             if position < len(segment.trace):
                 return segment, position
@@ -111,8 +117,8 @@ class WindowTooLong(TargetError):
     def __init__(self, program: str, limit: int) -> None:
         super().__init__(
             program,
-            f"executes more than {limit} instructions in scope, too many to step: name a function "
-            "with shorter calls; a whole program is counted if valgrind is installed",
+            f"executes more than {limit} instructions in scope, too many to single-step: name a "
+            "function with shorter calls, or install valgrind to count those of a whole program",
         )
 
 
@@ -126,7 +132,9 @@ def record_window(
     markers: Sequence[int] = (),
     watch: Callable[[int], None] | None = None,
 ) -> NDArray[np.int64]:
-    """Step from the current stop to the end of the program or function, or to a marker.
+    """Single-step one window of a run, and return the addresses that execute in scope, in order.
+
+    The window begins at the current stop. It ends with the program or function, or at a marker.
 
     Args:
         tracee: the process, stopped at the start of the window.
@@ -187,7 +195,7 @@ class _Blanket:
         self._code = {span.start: tracee.memory.read(span.start, len(span)) for span in scope.spans}
 
     def run_native(self, stop: NDArray[np.int64]) -> bool:
-        """Run code out of scope. Return False if the program or the window's function ended."""
+        """Run natively up to code in scope. Return False if the program or function ends first."""
         tracee, registers, returns_to = self._tracee, self._tracee.registers, int(stop[0])
         with contextlib.ExitStack() as undo:
             if returns_to > 0 and returns_to not in self._scope:
@@ -211,7 +219,7 @@ class _Blanket:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Way:
-    """The stages of a trigger for one executed instruction, and their cost in counted hits."""
+    """A possible trigger for one executed instruction: its stages, and its cost in counted hits."""
 
     cost: int
     stages: tuple[CountedStop, ...]
@@ -223,7 +231,7 @@ _cost = attrgetter("cost")
 def _plan_trigger(
     segment: Segment, index: int, locate: Locate, code_at: CodeAt | None
 ) -> tuple[tuple[CountedStop, ...], int]:
-    """Plan the cheapest exact trigger of one executed instruction of a segment.
+    """Return the cheapest exact trigger for the executed instruction at `index` in a segment.
 
     Every counted hit costs the same. If many hits would be needed, the trigger first counts to a
     rarely executed instruction shortly before the target and then counts the target's executions,
@@ -245,7 +253,7 @@ def _plan_trigger(
 
 
 def _anchored(segment: Segment, index: int, locate: Locate) -> Iterator[_Way]:
-    """Yield the cheapest way that first stops at an earlier instruction, if it saves hits."""
+    """Yield the cheapest trigger that first stops at an earlier instruction, if it saves hits."""
     target, k = segment.trace[index], int(segment.ranks[index])
     first = max(0, index - _HORIZON)
     before = segment.trace[first:index] == target
@@ -257,7 +265,7 @@ def _anchored(segment: Segment, index: int, locate: Locate) -> Iterator[_Way]:
 
 
 def _detoured(segment: Segment, index: int, locate: Locate, code_at: CodeAt) -> Iterator[_Way]:
-    """Yield a way with a detour at the target, or at the nearest earlier place where one fits."""
+    """Yield a trigger with a detour at the target, or at the nearest earlier place with room."""
 
     def executions(address: int) -> int:
         return int(np.count_nonzero(segment.trace == address))
@@ -272,7 +280,7 @@ def _detoured(segment: Segment, index: int, locate: Locate, code_at: CodeAt) -> 
 def _through(
     segment: Segment, place: int, index: int, locate: Locate, detour: Detour | None = None
 ) -> _Way:
-    """Return the way that counts to one executed instruction, and from there to the target."""
+    """Return the trigger that counts up to the instruction at `place`, then up to the target."""
     rank, target = int(segment.ranks[place]), segment.trace[index]
     stages = [CountedStop(locate(int(segment.trace[place])), rank, detour)]
     cost = rank if detour is None else min(rank, DETOUR_COST)
@@ -291,16 +299,17 @@ def draw_fault(
     code_at: CodeAt,
     locate: Locate,
 ) -> InstructionFault:
-    """Draw a fault uniformly from the executed instructions with an operand the model allows.
+    """Draw a fault uniformly from the executed instructions that have a suitable operand.
 
-    If an instruction has no such operand, another one is drawn, so the others stay equally likely.
+    If a drawn instruction has no operand that the fault model allows, another instruction is drawn.
+    So all suitable instructions stay equally likely.
 
     Args:
         plan: a strategy whose rule is instruction-uniform.
         code_at: returns 16 bytes of code at an address.
 
     Raises:
-        FaultError: no instruction in scope was executed, or none of many drawn ones has such an
+        FaultError: no instruction in scope was executed, or none of many drawn ones has a suitable
             operand.
     """
     if not stratum.executed:
@@ -336,7 +345,7 @@ def draw_fault_here(
     rng: np.random.Generator,
     execution: int = 0,
 ) -> tuple[InstructionFault | None, str]:
-    """Draw a fault in the instruction before which a thread has stopped.
+    """Draw a fault in the instruction that the stopped thread is about to execute.
 
     Args:
         execution: execution number to record.

@@ -65,7 +65,7 @@ class Program:
         stdin: Path = Path(os.devnull),
         memory_bytes: int | None = MEMORY_BYTES,
     ) -> Program:
-        """Make a command. Its program is looked up on the PATH.
+        """Create a program from a command line, whose first word is looked up on the PATH.
 
         Args:
             environment: the program's environment; by default, this process's variables for paths,
@@ -73,7 +73,7 @@ class Program:
             variables: additional or changed variables.
 
         Raises:
-            TargetError: no such program, or it cannot be executed.
+            TargetError: the program does not exist or cannot be executed.
         """
         program = shutil.which(argv[0])
         if program is None:
@@ -125,7 +125,7 @@ def spawn(
 
 
 def run_to_entry(tracee: Tracee) -> bool:
-    """Run to the program's entry point; its shared libraries are mapped by then.
+    """Run to the program's entry point, where its shared libraries are mapped already.
 
     Returns:
         False if the program ended first, for example because a library is missing.
@@ -168,7 +168,7 @@ def _await_exec(tracee: Tracee, command: Program) -> None:
 
 
 def _fix_random_bytes(tracee: Tracee) -> None:
-    """Replace the random bytes that the kernel passes to a new program by fixed bytes.
+    """Replace the random bytes that the kernel passes to a new program with fixed bytes.
 
     libc derives its stack canary from them.
     """
@@ -178,7 +178,10 @@ def _fix_random_bytes(tracee: Tracee) -> None:
 
 
 def _auxiliary(pid: int, key: int) -> int | None:
-    """Return one value of a program's auxiliary vector (getauxval(3)); None if it is missing."""
+    """Return the value of `key` in a process's auxiliary vector, or None if it is missing.
+
+    The keys are those of getauxval(3).
+    """
     words = struct.iter_unpack("=QQ", Path(f"/proc/{pid}/auxv").read_bytes())
     return next((value for name, value in words if name == key), None)
 
@@ -212,7 +215,7 @@ _PATHS = {
 
 @dataclass(slots=True)
 class ObservedRun:
-    """The observed actions of a program in one run.
+    """The actions of a program in one run, as far as its system calls show them.
 
     Attributes:
         started: description of the first thread, child or program that it started; empty if none.
@@ -229,7 +232,10 @@ class ObservedRun:
 
 
 def watch(tracee: Tracee, *, wall_s: float) -> ObservedRun:
-    """Run a stopped program to its end, for at most `wall_s`, and watch its system calls."""
+    """Run a stopped program to its end, for at most `wall_s` seconds, and watch its system calls.
+
+    Watching stops early if the program starts a thread, a child process or another program.
+    """
     observed, entering, number = ObservedRun(), True, 0
     with linux.ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s) as alarm:
         while True:
@@ -255,7 +261,7 @@ def watch(tracee: Tracee, *, wall_s: float) -> ObservedRun:
 
 
 def _record_entry(tracee: Tracee, observed: ObservedRun) -> None:
-    """At the entry of a system call, record what it requests."""
+    """At the entry of a system call, record any file to be changed and any use of a terminal."""
     registers = tracee.registers
     number = registers.system_call
     if number == _IOCTL:
@@ -294,7 +300,7 @@ def _signed(value: int, bits: int) -> int:
 
 
 def _text(memory: linux.Memory, address: int) -> str:
-    """Return the NUL-terminated text at an address; empty if it cannot be read."""
+    """Return the NUL-terminated text at an address, or an empty string if it cannot be read."""
     try:
         data = memory.read(address, 4096 - address % 4096)
         if b"\0" not in data:

@@ -68,7 +68,10 @@ class StoppedFork:
         return (self._process / "maps").read_text()
 
     def _own_pages(self) -> NDArray[np.int64]:
-        """Return the numbers (n,) of pages that the fork alone maps or that are swapped out."""
+        """Return the numbers of the pages that the fork alone maps or that are swapped out.
+
+        The array has shape (n,).
+        """
         numbers = []
         with (self._process / "pagemap").open("rb", buffering=0) as table:
             for line in self._maps().splitlines():
@@ -81,7 +84,7 @@ class StoppedFork:
         return np.concatenate(numbers)
 
     def _words(self, pages: NDArray[np.int64]) -> NDArray[np.uint64]:
-        """Return the contents of pages (n,) as words (n, 512), with ignored words set to 0."""
+        """Return the contents of pages as words, of shape (n, 512), with ignored words set to 0."""
         memory, data = self.tracee.memory, bytearray()
         for run in np.split(pages, np.flatnonzero(np.diff(pages) != 1) + 1):
             data += memory.read(int(run[0]) * _PAGE, len(run) * _PAGE)

@@ -129,7 +129,10 @@ class ExecutionCounter:
         self._fd = _open_event(tid, address, stop_at, inherited=inherited)
 
     def read(self) -> int:
-        """Return the number of executions since the start, even after the thread has ended."""
+        """Return the number of executions since the counter was created.
+
+        The counter can be read even after the thread has ended.
+        """
         return int.from_bytes(os.read(self._fd, 8), "little")
 
     def close(self) -> None:
@@ -138,7 +141,7 @@ class ExecutionCounter:
 
 
 def perf_allowed() -> str | None:
-    """Return why counted breakpoints cannot be opened, or None if they can."""
+    """Return the reason why this machine refuses counted breakpoints, or None if it allows them."""
     try:
         os.close(_open_event(0, 0x1000, 1_000_000))
     except OSError as error:
@@ -154,14 +157,14 @@ _ANY_CHILD = -1
 
 
 def _signal_code(tid: int) -> int:
-    """Return the `si_code` of a signal-delivery stop."""
+    """Return the `si_code` of the signal at which a thread has stopped."""
     buffer = (ctypes.c_int * 32)()
     linux.request(linux.GETSIGINFO, tid, 0, ctypes.addressof(buffer))
     return int(buffer[2])
 
 
 def _signal_of(status: linux.Status) -> int:
-    """Return the signal that a stop delivers to its thread; 0 for none or the tracer's own."""
+    """Return the signal to deliver to a stopped thread, or 0 if none or only the tracer's own."""
     if not status.stopped or status.event:
         return 0
     ours = status.signal == signal.SIGTRAP and _signal_code(status.tid) == _TRAP_PERF
@@ -169,7 +172,7 @@ def _signal_of(status: linux.Status) -> int:
 
 
 def threads_of(pid: int) -> list[int]:
-    """Return the thread ids of a process, ascending; empty when it has ended."""
+    """Return the thread ids of a process in ascending order; empty if the process has ended."""
     try:
         return sorted(int(name) for name in os.listdir(f"/proc/{pid}/task"))
     except (FileNotFoundError, ProcessLookupError):
@@ -185,11 +188,11 @@ class Ended:
 
     @classmethod
     def of(cls, code: int) -> Ended:
-        """Convert an exit code in the form of `subprocess`: a negative one is a signal."""
+        """Convert an exit code as `subprocess` gives it, where a negative code is a signal."""
         return cls(exit_code=None, signal=-code) if code < 0 else cls(exit_code=code, signal=None)
 
     def describe(self) -> str:
-        """Describe the end for a record."""
+        """Describe in words, for a record, how the process ended."""
         if self.signal is not None:
             known = self.signal in signal.Signals.__members__.values()
             return f"killed by {signal.Signals(self.signal).name if known else self.signal}"
@@ -200,7 +203,7 @@ class EndWatch:
     """Detects the end of a process, which need not be a child (pidfd_open(2)).
 
     Raises:
-        ProcessLookupError: There is no such process.
+        ProcessLookupError: The process does not exist.
     """
 
     def __init__(self, pid: int) -> None:
@@ -209,7 +212,10 @@ class EndWatch:
         self._poller.register(self._descriptor, select.POLLIN)
 
     def look(self) -> Ended | None:
-        """Return how the process ended; None if it has not. Once reaped, its status is unknown."""
+        """Return how the process ended, or None if it still runs.
+
+        The exit status is unknown if the process has already been reaped.
+        """
         if not self._poller.poll(0):
             return None
         try:
@@ -222,7 +228,7 @@ class EndWatch:
         return Ended.of(os.waitstatus_to_exitcode(int(status)))
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stop watching the process."""
         os.close(self._descriptor)
 
 
@@ -255,13 +261,13 @@ class Tracee:
         The attaching thread must have no other child that other code waits for.
 
         Args:
-            thread: the target; None for the main thread.
+            thread: id of the target; None for the main thread.
             mechanism: how executions are counted; by default the best that is allowed.
             alone: the process has only one thread. The attaching thread may trace others as well.
 
         Raises:
-            TracingForbidden: the operating system refuses.
-            TargetError: no such process.
+            TracingForbidden: the operating system does not allow tracing.
+            TargetError: the process does not exist or has ended.
         """
         seized: set[int] = set()
         while missing := [t for t in threads_of(pid) if t not in seized]:
@@ -290,15 +296,24 @@ class Tracee:
         self._interrupting = False
 
     def step(self) -> Ended | None:
-        """Execute one instruction, or one iteration of a repeated one. Returns as `resume` does."""
+        """Execute one instruction of the target, or one iteration of a repeated string instruction.
+
+        Returns None, or how the process ended.
+        """
         return self._go(linux.SINGLESTEP)
 
     def resume(self) -> Ended | None:
-        """Run until the tracer's trap stops the target. Return None, or how the process ended."""
+        """Run until the tracer's trap stops the target or the process ends.
+
+        Returns None, or how the process ended.
+        """
         return self._go(linux.CONT)
 
     def resume_until_alarm(self, alarm: ProcessTimer) -> Ended | None:
-        """Run until `alarm` sends its SIGTRAP, which is not delivered to the program."""
+        """Run until `alarm` sends its SIGTRAP. Return None, or how the process ended.
+
+        The signal is not delivered to the program.
+        """
         self._expecting_alarm = True
         try:
             with alarm:
@@ -334,7 +349,7 @@ class Tracee:
     def run_any_to(self, address: int) -> bool:
         """Run until any thread is about to execute `address`. That thread becomes the target.
 
-        Without `PERF`, only the current target thread is awaited.
+        With the mechanism `DEBUG`, only the current target thread is awaited.
 
         Returns:
             False if the process ended first.
@@ -365,7 +380,10 @@ class Tracee:
             return False
 
     def run_for(self, duration_s: float) -> Ended | None:
-        """Let the stopped target run for a wall-clock time, then stop it wherever it is."""
+        """Let the stopped target run for a wall-clock time, then stop it wherever it is.
+
+        Returns None, or how the process ended.
+        """
         self.registers.forget()
         with contextlib.suppress(ProcessLookupError):  # killed at a stop: its end is reported next
             linux.request(linux.CONT, self.tid, 0, self._take_signal())
@@ -384,7 +402,7 @@ class Tracee:
         return self.ended
 
     def count_to_end(self, address: int) -> int:
-        """Run to the end of the program and count the executions of `address` on the way."""
+        """Run to the program's end, and count the executions of the instruction at `address`."""
         self.registers.rearm()
         if self.mechanism is Mechanism.PERF:
             with contextlib.closing(ExecutionCounter(self.tid, address)) as counter:
@@ -398,7 +416,10 @@ class Tracee:
         return count
 
     def breakpoint_at(self, address: int, count: int = 1) -> ExecutionCounter | _DebugBreakpoint:
-        """Set a breakpoint before execution `count` of `address`; DEBUG stops at each execution."""
+        """Set a breakpoint before execution `count` of the instruction at `address`.
+
+        With the mechanism `DEBUG`, the breakpoint stops at every execution.
+        """
         if self.mechanism is Mechanism.PERF:
             try:
                 return ExecutionCounter(self.tid, address, count)
@@ -456,7 +477,10 @@ class Tracee:
         return calls
 
     def system_call(self, number: int, *arguments: int) -> int:
-        """Make the stopped target execute a system call, then restore its state."""
+        """Make the stopped target execute a system call, and return the call's result.
+
+        Afterwards, the target has the same state as before.
+        """
         before, here = self.registers.general(), self.registers.ip
         code = self.memory.read(here, len(_SYSTEM_CALL))
         self.memory.write(here, _SYSTEM_CALL)
@@ -469,7 +493,11 @@ class Tracee:
         return result
 
     def _checked_call(self, number: int, *arguments: int) -> int:
-        """Make the target execute a system call. Raise its error as OSError."""
+        """Make the stopped target execute a system call, and return the result.
+
+        Raises:
+            OSError: the system call failed.
+        """
         result = self.system_call(number, *arguments)
         if result >> 63:
             code = (1 << 64) - result
@@ -477,7 +505,7 @@ class Tracee:
         return result
 
     def step_back(self) -> None:
-        """Go back to the instruction that began the current system call (see `run_to_call`)."""
+        """Skip the system call at which `run_to_call` stopped, and go back to its instruction."""
         before, call = self.registers.general(), self.registers.read("orig_rax")
         self.registers.write("orig_rax", _NO_CALL)
         linux.request(linux.SYSCALL, self.tid)
@@ -487,10 +515,12 @@ class Tracee:
         self.registers.write_together({"rip": start, "rax": call})
 
     def connect(self, descriptor: int, address: bytes) -> None:
-        """Replace a socket of the target with a stream socket connected to a Unix address.
+        """Replace the target's socket `descriptor` with a stream socket connected to `address`.
+
+        The address is that of a Unix socket.
 
         Raises:
-            OSError: the operating system refuses.
+            OSError: the operating system refuses one of the system calls.
         """
         data = socket.AF_UNIX.to_bytes(2, sys.byteorder) + address
         place = self.registers.sp - _FREE
@@ -503,7 +533,7 @@ class Tracee:
         self.memory.write(place, kept)
 
     def detach(self) -> None:
-        """Let the process and its children continue without a tracer, or record its end.
+        """Let the process and its children continue untraced. If it has ended, record how.
 
         The target thread must be stopped. Even a thread that no longer appears in its process, such
         as a killed one, is awaited, because Linux reports the main thread's end last.
@@ -553,7 +583,10 @@ class Tracee:
         }
 
     def kill(self) -> Ended:
-        """Kill the process, and its group if we started it, and wait until all have ended."""
+        """Kill the process, wait for its end, and return how it ended.
+
+        If we started the process, the whole process group is killed and awaited.
+        """
         if self.ended is None:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
@@ -609,7 +642,7 @@ class Tracee:
             status = self._wait()
 
     def _wait(self, options: int = 0) -> linux.Status:
-        """Wait for a report; with WNOHANG, return one about thread 0 if there is none."""
+        """Wait for a report and return it. With WNOHANG, thread 0 means that there is none yet."""
         stopped, raw = os.waitpid(self.group, linux.WALL | _NOT_FROM_OTHERS | options)
         return linux.Status(stopped, raw)
 
@@ -664,7 +697,11 @@ class Tracee:
     # -- counted stops
 
     def _run_to_detoured(self, address: int, count: int, detour: Detour) -> bool | None:
-        """Count by a detour. Returns as `run_to` does, or None if no detour can be made here."""
+        """Run to execution `count` of `address`, which a detour counts.
+
+        Returns:
+            False if the program ended first, None if no detour can be made here.
+        """
         if address < self.registers.ip < address + detour.size:
             return None
         pages = self._map_near(address)
@@ -690,7 +727,10 @@ class Tracee:
             self.memory.write(address, data)
 
     def _map_near(self, address: int) -> int | None:
-        """Map pages within reach of a jump, away from any later heap or library mappings."""
+        """Map pages within reach of a jump from `address`, and return where they are.
+
+        They are away from any later heap or library mappings. Returns None if no place is free.
+        """
         for distance in _DISTANCES:
             pages = (address - distance) & ~4095
             if pages > 0 and self.system_call(

@@ -88,7 +88,7 @@ class _VectorForm:
         self.touched = [Touched() for _ in operands]
 
     def source(self, name: str) -> int:
-        """Return the position of operand "a" or "b"."""
+        """Return the position of operand "a", the first source, or "b", the last operand."""
         return self.first if name == "a" else self.last
 
     def is_vector(self, position: int) -> bool:
@@ -140,7 +140,10 @@ def vector_bits(decoded: Any) -> tuple[Touched, ...] | None:
 
 
 def _scalar(form: _VectorForm) -> int:
-    """Handle a scalar instruction. Return the width of its element, or 0 if it is not scalar."""
+    """Mark the bits that a scalar instruction uses.
+
+    Returns the width of its element in bits, or 0 if the instruction is not scalar.
+    """
     name = form.mnemonic
     if match := _COMPARISON.match(name):
         for position in (form.target, form.last):
@@ -172,7 +175,10 @@ def _operation(form: _VectorForm, lane: int) -> int:
 
 
 def _merged(form: _VectorForm, source: int, lane: int) -> int:
-    """Handle a function of the last operand; other elements come from the first source."""
+    """Mark the bits of a scalar function of the last operand, and return the written width.
+
+    The other elements come from the first source.
+    """
     if lane and form.is_vector(form.target):
         _write_lane(form, lane)
     else:
@@ -182,7 +188,10 @@ def _merged(form: _VectorForm, source: int, lane: int) -> int:
 
 
 def _write_lane(form: _VectorForm, lane: int) -> None:
-    """Write the lowest element; VEX forms copy the rest of 128 bits from the first source."""
+    """Mark the lowest element as written.
+
+    VEX forms copy the rest of the lowest 128 bits from the first source.
+    """
     rest = low(128) & ~low(lane)
     if form.same(form.first, form.target):
         form.write(low(lane), kept=rest if form.vex else ALL & ~low(lane))
@@ -209,7 +218,7 @@ def _between(form: _VectorForm) -> bool:
 
 
 def _permuted(form: _VectorForm) -> bool:
-    """Handle an instruction that moves elements. Return False for any other."""
+    """Mark the bits used by an instruction that moves elements. Return False for any other."""
     moved = _pieces(form)
     if moved is None:
         return False
@@ -297,7 +306,10 @@ def _interleave(start: Callable[[int], int]) -> _Lane:
 
 
 def _chosen(operands: str, bits: int, step: int = 0) -> _Lane:
-    """Select each element by its own bits of the immediate, shifted by `step` per lane."""
+    """Return a rule that selects each element by its own bits of the immediate.
+
+    In each further lane, these bits are `step` positions higher.
+    """
 
     def lane(imm: int, count: int, number: int) -> list[Piece]:
         return [
@@ -379,7 +391,10 @@ _BY_IMMEDIATE = [lane for name, (_, lane) in _SHUFFLES.items() if not re.match("
 
 
 def _packed(form: _VectorForm) -> None:
-    """Handle the rest, which use whole registers except for conversions, controls and counts."""
+    """Mark the bits of any other instruction.
+
+    It uses whole registers, except for conversions, controls and counts.
+    """
     name, width = form.mnemonic, form.widths[form.target]
     alone = form.same(form.first, form.last) and len(form.sources) == 1 + form.vex
     sources = [] if alone and _ZEROING.match(name) else list(form.sources)

@@ -16,9 +16,9 @@ CACHE = ".profiles"  # subfolder of the runs' folder
 
 
 def kept_in(folder: Path, golden: MissionConfig) -> Path:
-    """Return the subfolder for a golden mission's requests and profiles.
+    """Return the subfolder of `folder` that keeps a golden mission's requests and profiles.
 
-    Its name is a hash of everything that determines the golden run.
+    The subfolder's name is a hash of everything that determines the golden run.
     """
     parts = [
         json.dumps(golden.to_dict(), sort_keys=True),

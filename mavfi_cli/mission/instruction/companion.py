@@ -36,7 +36,7 @@ _SWITCH_S = 1e-4
 
 
 class ProcessInjection(CompanionFault):
-    """Strikes an instruction of a running program once. A tracer thread does the work.
+    """Injection of one instruction-level fault into a running program, by a tracer thread.
 
     Args:
         request: The fault.
@@ -44,7 +44,7 @@ class ProcessInjection(CompanionFault):
         repeat: Record of a fault whose instruction is to be struck again; None to draw one.
 
     Raises:
-        UnknownName: The companion has no such program.
+        UnknownName: The companion has no program with the name in `request`.
         FaultError: Settings of the fault contradict each other.
     """
 
@@ -65,12 +65,15 @@ class ProcessInjection(CompanionFault):
         self._leads, self._codes = True, 0  # is it the program's own; number of earlier ends
 
     def aim_at(self, shortest_flight_s: float) -> None:
-        """See `CompanionFault`."""
+        """Draw the time of the fault, as described in `CompanionFault.aim_at`."""
         self._moment = Killer(self._request.moment(), shortest_flight_s, self._on_strike)
         self.injector = self._moment
 
     def begin(self, path: Path) -> None:
-        """Write the planned fault. Load code that cannot be loaded while a thread is stopped."""
+        """Write the record of the planned fault to `path`.
+
+        Also load the code that cannot be loaded while a thread is stopped.
+        """
         stepper.load()
         self._usual_switch_s = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_S)
@@ -86,7 +89,7 @@ class ProcessInjection(CompanionFault):
         record.write(path, record.undrawn(**self._context))
 
     def tick(self, moment: Moment) -> None:
-        """See `CompanionFault`."""
+        """Strike the program if the fault is due. Later, check whether the fault has ended it."""
         self.injector.strike(moment)
         if self._watch is None or self.ends:
             return
@@ -102,7 +105,7 @@ class ProcessInjection(CompanionFault):
             self.ends = {self._request.program: NodeEnds(crashes=[crash])}
 
     def _look(self, watch: EndWatch, program: RunningProgram) -> Ended | None:
-        """Return how the struck process ended; None if that is not known yet."""
+        """Return how the struck process ended, or None while that is unknown."""
         ended = watch.look()
         if ended is None or not self._leads or ended.exit_code is not None or ended.signal:
             return ended
@@ -110,7 +113,7 @@ class ProcessInjection(CompanionFault):
         return Ended.of(codes[0]) if codes else None
 
     def close(self) -> None:
-        """See `NoInjection`."""
+        """Stop watching the struck process, and restore Python's thread switch interval."""
         if self._watch is not None:
             self._watch.close()
             self._watch = None
@@ -140,14 +143,14 @@ class ProcessInjection(CompanionFault):
         )  # fmt: skip
 
     def news(self) -> list[str]:
-        """Describe the fault once it has struck."""
+        """Return a description of the fault, once, after the tracer has finished."""
         if self._reported or self._tracer is None or not self._tracer.done:
             return []
         self._reported = True
         return [record.describe(self._written())]
 
     def finish(self) -> dict[str, Any]:
-        """Return the fault's record. The programs must have ended."""
+        """Return the fault's record. Call it only after the programs have ended."""
         return record.repeatable(self._written())
 
     def _written(self) -> FaultRecord:
@@ -165,11 +168,13 @@ class ProcessInjection(CompanionFault):
 
 
 def _process_of(leader: int | None, executable: str | None) -> int | None:
-    """Return the first process of a program's session that runs an executable; None without one.
+    """Return the id of the first process in a program's session that runs a given executable.
+
+    Return None if no such process exists.
 
     Args:
-        leader: The program's own process, which leads the session.
-        executable: File name of the executable; None for the leader.
+        leader: Id of the program's own process, which leads the session; None if it is not running.
+        executable: File name of the executable. If None, the leader itself is returned.
     """
     if leader is None or executable is None:
         return leader

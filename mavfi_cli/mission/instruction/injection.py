@@ -73,7 +73,7 @@ _LARGEST = 1 << 31  # bytes of a kept file
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GoldenOrders:
-    """The briefing of a golden run, and its requests by node.
+    """The briefing of a golden run, and the requests that each of its nodes received.
 
     Attributes:
         sequence: node of every request, in order of start.
@@ -89,7 +89,7 @@ class GoldenOrders:
 
     @classmethod
     def of(cls, recorder: Recorder) -> GoldenOrders:
-        """Return the briefing and requests that a recorder captured in a flight."""
+        """Return the briefing and the requests that a recorder has captured in a flight."""
         assert recorder.briefing is not None
         orders = {name: tuple(given) for name, given in recorder.orders.items()}
         return cls(briefing=recorder.briefing, sequence=tuple(recorder.sequence), **orders)
@@ -99,14 +99,14 @@ class GoldenOrders:
             raise ValueError("sequence must name the node of every request")
 
     def of_process(self, nodes: Sequence[str]) -> list[Order]:
-        """Return the requests to nodes that share a process, in order of start."""
+        """Return the requests to all nodes of one process, in order of start."""
         left = {node: iter(getattr(self, node)) for node in nodes}
         return [(node, *next(left[node])) for node in self.sequence if node in left]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Entries:
-    """Cumulative number of kernel entries at the end of every request to its node."""
+    """The cumulative number of a kernel's entries at the end of every request to its node."""
 
     counts: tuple[int, ...]
 
@@ -118,16 +118,20 @@ class _Entries:
 def _golden_orders(
     golden: MissionConfig, profiles: Path, fly: Callable[[Path], Recorder]
 ) -> GoldenOrders:
-    """Return the kept requests of a golden mission; if there are none, `fly` it into a folder."""
+    """Return the stored requests of a golden mission. If none are stored, call `fly` for them.
+
+    `fly` receives a folder for the flight. The requests that it records are stored.
+    """
     folder = own_folder(kept_in(own_folder(profiles), golden))
     return _kept(folder / "orders.npz", GoldenOrders, lambda: GoldenOrders.of(fly(folder)))
 
 
 def keep_orders(golden: MissionConfig, profiles: Path, fly_golden: FlyGolden) -> GoldenOrders:
-    """Return the kept requests of a golden mission; if there are none, fly it.
+    """Return the stored requests of a golden mission. If none are stored, fly it and store them.
 
     Args:
-        profiles: folder of golden flights and profiles.
+        profiles: folder that keeps golden flights and profiles.
+        fly_golden: flies the golden mission if no requests are stored.
 
     Raises:
         MavfiError: the mission cannot be flown.
@@ -144,7 +148,7 @@ def keep_orders(golden: MissionConfig, profiles: Path, fly_golden: FlyGolden) ->
 def _plan_fault(
     config: MissionConfig, profiles: Path, fly_golden: FlyGolden
 ) -> tuple[InstructionFault, dict[str, Any]]:
-    """Draw a mission's fault. Return it with the record's entries that _CONTEXT names."""
+    """Draw a mission's fault. Return it with the entries of its record that _CONTEXT names."""
     request, golden = config.instruction, config.golden
     assert request is not None
     orders = keep_orders(golden, profiles, fly_golden)
@@ -157,7 +161,7 @@ def _plan_fault(
 
 
 class _GoldenNode:
-    """A node of a golden flight, for drawing its faults. It must be used in a single thread."""
+    """A node of a golden flight, from which faults are drawn. Use it in a single thread only."""
 
     def __init__(
         self, golden: MissionConfig, node: str, profiles: Path, kept: GoldenOrders
@@ -174,18 +178,18 @@ class _GoldenNode:
 
     @property
     def rehearsal(self) -> Rehearsal:
-        """The node's rehearsal, which starts when it is first used."""
+        """The rehearsal of the node, which is started when it is first used."""
         if self._rehearsal is None:
             self._rehearsal = Rehearsal(self._setup, self.name, self._orders)
         return self._rehearsal
 
     def close(self) -> None:
-        """End the node."""
+        """End the node's process, if it was started."""
         if self._rehearsal is not None:
             self._rehearsal.close()
 
     def draw(self, request: InstructionConfig) -> tuple[KernelInvocation, np.random.Generator]:
-        """Draw the invocation to strike. Return it with the generator for the rest of the draw.
+        """Draw the invocation to strike. Return it with the generator for the remaining draws.
 
         Raises:
             FaultError: the flight never enters the kernel.
@@ -211,7 +215,7 @@ class _GoldenNode:
     def fault(
         self, request: InstructionConfig, drawn: KernelInvocation, rng: np.random.Generator
     ) -> tuple[InstructionFault, dict[str, Any]]:
-        """Draw the fault in an invocation. Return it with the entries that _CONTEXT names."""
+        """Draw a fault in an invocation. Return it and the record's entries that _CONTEXT names."""
         strategy = replace(mission_strategy(request), whole_process=False)
         profiling = Stream.FAULT.generator(self._golden.seed, "profile", self.kernel, drawn.number)
         profile = _kept(
@@ -237,7 +241,10 @@ class _GoldenNode:
         return replace(fault, corruption=None) if request.null else fault, context
 
     def received_alike(self, flown: GoldenOrders, drawn: KernelInvocation) -> bool:
-        """Return True if another flight sent equal requests up to that of the invocation."""
+        """Return True if another flight sent this node's process the same requests.
+
+        The requests are compared up to the one that contains the drawn invocation.
+        """
         own = [at for at, (node, *_) in enumerate(self._orders) if node == self.name]
         until = own[drawn.order - 1] + 1
         theirs = flown.of_process(self.process)[:until]
@@ -254,15 +261,18 @@ def struck_nodes(
     *,
     profiles: Path,
 ) -> dict[int, StruckInjection]:
-    """Inject the faults of missions in rehearsals. Return the injections by mission number.
-
-    Faults that cannot be planned or compared there are left out.
+    """Inject the faults of several missions in rehearsals of their nodes.
 
     Args:
         flown: the flown mission, which equals the others without their faults.
         requests: the faults, by mission number.
         recorder: recorder of the flight of `flown`. If `flown` differs from its golden mission, the
-            requests of the golden mission must already be kept.
+            requests of the golden mission must already be stored.
+        profiles: folder that keeps golden flights and profiles.
+
+    Returns:
+        The injections by mission number. Faults that cannot be planned, or whose effect cannot be
+        determined in a rehearsal, are omitted.
     """
     golden, seen = flown.golden, GoldenOrders.of(recorder)
     orders = _golden_orders(golden, profiles, lambda _: recorder)
@@ -295,13 +305,14 @@ def struck_nodes(
 
 
 def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) -> KernelInvocation:
-    """Draw one invocation of a kernel uniformly, given the entries up to the end of each request.
+    """Draw one invocation of a kernel uniformly from those of a golden run.
 
     Every entry is an invocation, except in a planner node. There the kernel is entered whenever an
     obstacle grid is built, at least once per request, and the request is the invocation.
 
     Args:
-        counts: cumulative entries at the end of every request of the golden run; not empty.
+        counts: cumulative number of the kernel's entries at the end of every request to the node;
+            not empty.
     """
     before = np.array([0, *counts[:-1]])
     if node != "planner":
@@ -318,7 +329,7 @@ def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) 
 
 
 def _is_sound(profile: TargetProfile) -> bool:
-    """Return True if a fault can be drawn from a profile that was read from a file."""
+    """Return True if a fault can be drawn from a profile, which was read from a file."""
     segments = [segment for stratum in profile.strata for segment in stratum.segments]
     return (
         bool(segments)
@@ -331,12 +342,12 @@ def _is_sound(profile: TargetProfile) -> bool:
 def _kept(
     path: Path, kind: type[T], make: Callable[[], T], *, sound: Callable[[T], bool] = lambda _: True
 ) -> T:
-    """Read a value from its file; if the file is missing or damaged, make the value and write it.
+    """Read a value from its file. If the file is missing or damaged, make the value and write it.
 
     A new value is read back, so that this mission gets the same value as all later ones.
 
     Args:
-        sound: Returns False for a value that this program cannot have made.
+        sound: Returns False for a value that this program cannot have written.
     """
     with contextlib.suppress(RecordError, ValueError):
         if sound(kept := unpack(read_bounded(path, _LARGEST), kind)):
@@ -350,7 +361,7 @@ def _kept(
 
 
 class InstructionInjection(NoInjection):
-    """One instruction-level fault in one mission; messages pass unchanged."""
+    """Injection of one instruction-level fault in one mission. Messages pass unchanged."""
 
     def __init__(
         self,
@@ -379,11 +390,13 @@ class InstructionInjection(NoInjection):
         fly_golden: FlyGolden,
         for_debugger: Callable[[int], None] | None = None,
     ) -> InstructionInjection:
-        """Draw the fault of a mission from its golden flight.
+        """Draw the fault of a mission from its golden flight, and return its injection.
 
         Args:
-            profiles: Folder of golden flights and profiles.
-            fly_golden: Flies the golden mission if its requests are not kept yet.
+            profiles: Folder that keeps golden flights and profiles.
+            fly_golden: Flies the golden mission if its requests are not stored yet.
+            for_debugger: Called with the id of the node's process once that process waits for a
+                debugger at the injected instruction.
 
         Raises:
             FaultError: The flight is not repeatable, or nothing in it can be struck.
@@ -460,7 +473,7 @@ class InstructionInjection(NoInjection):
         return done
 
     def _ending(self) -> str | None:
-        """Return how the node ended, if the tracer noticed it."""
+        """Return how the node ended, or None if the tracer did not notice its end."""
         ended = None if self._tracer is None else self._tracer.result().ended
         return None if ended is None else ended.describe()
 
@@ -474,7 +487,7 @@ class InstructionInjection(NoInjection):
         self._struck = self._struck or self._reached.is_set()
 
     def news(self) -> list[str]:
-        """Describe the fault once the struck invocation has ended."""
+        """Return a description of the fault, once, after the struck invocation has ended."""
         if self._reported or self._tracer is None or not self._struck:
             return []
         self._reported = True
@@ -482,18 +495,21 @@ class InstructionInjection(NoInjection):
         return [] if self._fault.corruption is None else [record.describe(done.record)]
 
     def finish(self) -> dict[str, Any]:
-        """Return the fault's record at the end of the mission, without what repetitions change."""
+        """Return the fault's record at the end of the mission.
+
+        Entries that differ between repetitions of the mission are omitted.
+        """
         assert self._tracer is not None
         return record.repeatable(self._tracer.result().record)
 
     def close(self) -> None:
-        """End the node's process if no executor owns it."""
+        """Kill the node's process, unless an executor already owns it."""
         if self._tracer is None:
             self._spawned.kill()
 
 
 class StruckInjection(StruckNode):
-    """A fault that has struck its node in a rehearsal."""
+    """Injection of an instruction-level fault that has struck its node in a rehearsal."""
 
     def __init__(self, struck: Struck, node: str, order: int) -> None:
         written = self._written = struck.record
@@ -502,9 +518,9 @@ class StruckInjection(StruckNode):
         self.how = struck.how
 
     def begin(self, path: Path) -> None:
-        """Write the record."""
+        """Write the fault's record to `path`."""
         record.write(path, self._written)
 
     def finish(self) -> dict[str, Any]:
-        """Return the record, as `InstructionInjection` does."""
+        """Return the fault's record, without the entries that differ between repetitions."""
         return record.repeatable(self._written)

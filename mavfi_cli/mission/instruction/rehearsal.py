@@ -67,7 +67,7 @@ class KernelInvocation:
 
 
 class NodeEffect(Enum):
-    """The effect of a fault on a node up to its answer."""
+    """The effect that a fault had on a node by the time of the node's answer."""
 
     MASKED = "masked"  # answer and memory are as without the fault
     CHANGED = "changed"
@@ -77,10 +77,10 @@ class NodeEffect(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Struck:
-    """A struck node.
+    """The result of striking a node in a rehearsal.
 
     Attributes:
-        record: fault record, as from a flight.
+        record: fault record, like that of a fault injected in a flight.
         process: process that serves this request and all later ones; None if the fault is masked.
         how: how the node ended or hung; empty if it answers.
     """
@@ -92,13 +92,15 @@ class Struck:
 
 
 class Rehearsal:
-    """The `AttackPlace` in which one invocation of a node's kernel runs.
+    """A node to which the requests of a golden flight are replayed, and which can be forked.
 
-    It must be used in a single thread.
+    It is the `AttackPlace` in which one invocation of the node's kernel runs. Use it in a single
+    thread only.
 
     Args:
         setup: the first message to the node's program.
-        orders: requests to all nodes of its process, in order of start.
+        node: name of the node.
+        orders: requests to the node and to all nodes that share its process, in order of start.
     """
 
     kind = "node"
@@ -118,18 +120,20 @@ class Rehearsal:
             undo.pop_all()
 
     def close(self) -> None:
-        """End the node."""
+        """End the node's process."""
         self._spawned.kill()
 
     @property
     def name(self) -> str:
-        """Name of the kernel."""
+        """Name of the node's kernel."""
         return self.scope_of_node.kernel
 
     # Orders
 
     def count_entries(self) -> list[int]:
-        """Count the kernel's entries up to the end of each request to the node, using a fork.
+        """Return the cumulative number of kernel entries at the end of each request to the node.
+
+        A fork of the node processes the requests.
 
         Raises:
             TracingForbidden: the operating system permits neither counting nor tracing.
@@ -151,10 +155,11 @@ class Rehearsal:
         return counts
 
     def go_to(self, invocation: KernelInvocation) -> None:
-        """Process the requests before an invocation, which must not precede the current one.
+        """Let the node process all requests that precede the one with the given invocation.
 
-        The node and its forks stay on one processor, because switching between two doubles the time
-        of stepping, and the C library keeps the processor's number in the memory of each thread.
+        The invocation must not precede that of an earlier call. The node and its forks stay on one
+        processor, because switching between two doubles the time of stepping, and the C library
+        keeps the processor's number in the memory of each thread.
         """
         linux.share_processor(self._spawned.pid)
         self._entry = invocation.entry - invocation.earlier
@@ -175,7 +180,7 @@ class Rehearsal:
         return self._stopped
 
     def _fork(self) -> Tracee:
-        """Fork the node, and send the fork the next request."""
+        """Fork the stopped node, and send the next request to the fork."""
         self._sender.join()
         fork, order = self._stop().fork(), self._orders[self._done]
         # Sending a long message blocks until the fork, which runs later, reads it.
@@ -186,23 +191,26 @@ class Rehearsal:
     # Profile
 
     def start(self) -> Tracee:
-        """Return a fork stopped at the start of the invocation. It will end without an answer."""
+        """Return a fork of the node, stopped at the start of the invocation.
+
+        The fork cannot send an answer, so it ends after the invocation.
+        """
         tracee = self._fork()
         if not tracee.run_to(self._image.address(self.scope_of_node.entry), self._entry):
-            raise TargetError(f"node {self._node}", "a fork does not begin the invocation again")
+            raise TargetError(f"node {self._node}", "a fork did not begin the invocation again")
         tracee.system_call(CLOSE, CHANNEL)
         return tracee
 
     def image(self, _: Tracee) -> Image:
-        """Return the memory image of the node and of each fork."""
+        """Return the memory image, which is the same for the node and all of its forks."""
         return self._image
 
     def scope(self, image: Image) -> Scope:
-        """Return the code in scope."""
+        """Return the code that faults may hit."""
         return image.scope(self.scope_of_node.objects)
 
     def profile(self, invocation: KernelInvocation, rng: np.random.Generator) -> TargetProfile:
-        """Profile an invocation by stepping all of it, or a sample.
+        """Profile an invocation by single-stepping all of its instructions, or a sample of them.
 
         Args:
             rng: draws the sample, if only a sample is stepped.
@@ -240,9 +248,9 @@ class Rehearsal:
     def strike(
         self, fault: InstructionFault, invocation: KernelInvocation, context: Mapping[str, Any]
     ) -> Struck:
-        """Strike an invocation in a fork, and compare the fork with two unstruck ones.
+        """Strike an invocation in a fork, and compare the fork with two forks without the fault.
 
-        If the struck fork differs, it is kept, so that a flight can continue with it.
+        If the struck fork differs from them, it is kept, so that a flight can continue with it.
 
         Args:
             context: further entries of the record.
@@ -250,7 +258,9 @@ class Rehearsal:
         Raises:
             TracingForbidden: the operating system does not permit tracing.
             OSError: no fork can be made, or its memory cannot be read.
-            FaultError: the location holds another instruction.
+            FaultError: another instruction is at the fault's location.
+            TargetError: the fork does not reach the fault's location, hangs before the fault
+                strikes, or cannot be compared.
         """
         self.go_to(invocation)
         objects = list(self.scope_of_node.objects)
@@ -270,7 +280,7 @@ class Rehearsal:
             with _limited(tracee) as alarm:
                 injection, followed = strike(tracee, here, window=64)
             if alarm.fired:
-                raise TargetError(f"node {self._node}", "it hangs before the fault strikes")
+                raise TargetError(f"node {self._node}", "it hung before the fault struck")
             reason = "" if injection is None else injection.reason
             done = record.completed(planned, injection, followed, not_injected_reason=reason)
             struck = _run_to_answer(tracee)
@@ -283,7 +293,7 @@ class Rehearsal:
             if len(unstruck) < 2:
                 raise TargetError(
                     f"node {self._node}",
-                    "it gives no answer when the same invocation is repeated without the fault",
+                    "it gave no answer when the same invocation was repeated without the fault",
                 )
             if remembers_the_same(struck, unstruck):
                 return Struck(record=done, effect=NodeEffect.MASKED)
@@ -292,7 +302,7 @@ class Rehearsal:
             return Struck(record=done, effect=NodeEffect.CHANGED, process=process)
 
     def _let_go(self, fork: Tracee) -> NodeProcess:
-        """Give a fork that is about to answer a connection of its own, and let it continue."""
+        """Give a connection of its own to a fork that is about to answer, and let it continue."""
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
             listener.bind("")  # an address that the operating system chooses
             listener.listen()
@@ -308,7 +318,7 @@ class Rehearsal:
 
 
 def _run_to_answer(tracee: Tracee) -> StoppedFork | NodeLost:
-    """Run a fork until it begins to send an answer, or until it has ended or hung."""
+    """Run a fork until it begins to send its answer, or return the loss if it ends or hangs."""
     calls: Sequence[tuple[int, ...]] = ()
     if tracee.ended is None:
         with _limited(tracee) as alarm:
@@ -329,12 +339,16 @@ def _process_at(connection: socket.socket) -> int:
 
 
 def _limited(tracee: Tracee) -> ProcessTimer:
-    """Return a timer that kills a node that hangs."""
+    """Return a timer that kills the node if it hangs."""
     return ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=HANG_CPU_S, wall_s=HANG_WALL_S)
 
 
 def _time_of(memory: linux.Memory, address: int, size: int) -> bytes:
-    """Return the pickled host time in an answer; empty if the answer is corrupted."""
+    """Return the packed host time in a node's answer, or b"" if the answer is corrupted.
+
+    Args:
+        address, size: Place and length of the answer in the memory.
+    """
     try:
         return struct.pack(">d", value_of(memory.read(address, size)).host_s)
     except Exception:  # a corrupted pickle can raise any error

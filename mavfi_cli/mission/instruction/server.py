@@ -22,7 +22,7 @@ from mavfi_cli.spec.mission import MissionConfig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setup:
-    """The first message to the program. The program replies with its `KernelScope`.
+    """The first message to the program of a node, which replies with the node's `KernelScope`.
 
     The memory of the node depends on the bytes of the message. So the message holds the golden
     mission, because all missions of a pair share it. It holds the mission as text, because a pickle
@@ -39,7 +39,7 @@ class Setup:
 
     @classmethod
     def of(cls, config: MissionConfig, briefing: Briefing, node: str) -> Setup:
-        """Build the message for a node of a mission."""
+        """Build the message for a node of a mission with or without a fault."""
         own_m = config.loaded_stack().goal_tolerance_m
         recorded = json.dumps(replace(config.golden, goal_tolerance_m=own_m).to_dict())
         golden = structure(json.loads(recorded), MissionConfig).to_dict()
@@ -47,12 +47,12 @@ class Setup:
 
     @property
     def config(self) -> MissionConfig:
-        """The golden mission."""
+        """The configuration of the golden mission."""
         return structure(json.loads(self.golden), MissionConfig)
 
 
 def main() -> None:
-    """Load every kernel, receive the node's setup, and serve until the connection closes."""
+    """Load all kernels, receive the node's setup, and serve it until the connection closes."""
     connection = socket.socket(fileno=CHANNEL)
     warm_up()
     try:

@@ -26,21 +26,21 @@ def require_viewer(path: Path | None) -> None:
     """
     suffix = None if path is None else path.suffix.lower()
     if suffix not in _NEEDED:
-        raise ConfigError("name a file that ends in .rrd (rerun) or .mcap (Foxglove)", path=path)
+        raise ConfigError("must end in .rrd (for rerun) or .mcap (for Foxglove)", path=path)
     package, extra = _NEEDED[suffix]
     if find_spec(package) is None:
         what = "rerun's window" if path is None else f"a {suffix} file"
-        raise MavfiError(f"{what} needs more packages: pip install 'mavfi[{extra}]'")
+        raise MavfiError(f"{what} needs optional packages: pip install 'mavfi[{extra}]'")
     if path is not None:
         require_output(path)
     elif sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
-        raise MavfiError("there is no display for rerun's window: use --save FILE.rrd")
+        raise MavfiError("cannot open rerun's window: no display; use --save FILE.rrd")
 
 
 def save(flights: Sequence[ViewedFlight], path: Path | None) -> None:
-    """Write flights for a viewer, atomically, in the format of the file's suffix.
+    """Write flights to a file for a viewer, in the format that the suffix of `path` selects.
 
-    If `path` is None, open rerun's viewer and leave it open.
+    The file is written atomically. If `path` is None, open rerun's viewer and leave it open.
 
     Raises:
         ConfigError: the suffix is neither .rrd nor .mcap.

@@ -41,10 +41,10 @@ _TALLEST_M = 15.0  # towers of generated worlds are 1000 m high, flights at most
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """What a viewer shows at one path from a stamp until the next entry.
+    """An item that a viewer shows from its stamp until the next entry with the same path.
 
     Attributes:
-        kind, data: what is shown.
+        kind, data: type and content of the item.
             `boxes`: centres (n, 3) of solid boxes along the axes: obstacles, voxels of a map.
             `marks`: centres (n, 3) of spheres: the goal, or where something happened.
             `points`: a point cloud (n, 3).
@@ -52,8 +52,8 @@ class Entry:
             `depth`: a depth frame with the pose of its camera.
             `pose`: position (3,) and yaw of the vehicle, which is level.
             `note`: an event of the flight.
-            `values`: the numbers of a control tick by the trace's column names; None where there
-            is none yet.
+            `values`: the numbers of a control tick by the trace's column names; a number that does
+            not exist yet is None.
         size_m: sizes of boxes (n, 3), radius of marks, or width of a line.
     """
 
@@ -66,17 +66,17 @@ class Entry:
 
     @property
     def urgent(self) -> bool:
-        """Whether a note reports a fault, an alarm or the death of a node."""
+        """Whether a `note` reports a fault, an alarm or the end of a node."""
         return self.data.kind in ("fault", "alarm", "node")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewedFlight:
-    """A flight to view.
+    """A flight to show in a viewer.
 
     Attributes:
-        name: First part of its paths, such as "golden".
-        recorder: What its nodes received; None leaves out depth frames, clouds and maps.
+        name: First part of the paths of its entries, such as "golden".
+        recorder: The inputs that its nodes received; None leaves out depth frames, clouds and maps.
     """
 
     name: str
@@ -85,21 +85,21 @@ class ViewedFlight:
 
     @property
     def colour(self) -> str:
-        """Colour of vehicle, path and setpoints, as in all pictures."""
+        """Colour of the flight's vehicle, path and setpoints, as in all pictures."""
         return FLIGHTS[0 if self.run.record.fault is None else 1]
 
     def entry(self, name: str, stamp_s: float, kind: str, data: Any, **look: Any) -> Entry:
-        """Return an entry with this name below the flight's path."""
+        """Return an entry of the flight, with the path `name` below the flight's own name."""
         return Entry(path=f"{self.name}/{name}", stamp_s=stamp_s, kind=kind, data=data, **look)
 
     def line(self, name: str, stamp_s: float, points: FloatArray, **look: Any) -> Entry:
-        """Return a line through points (n, 3), in the flight's colour."""
+        """Return an entry with a line through points (n, 3), by default in the flight's colour."""
         look = {"colour": self.colour, **look}
         return self.entry(name, stamp_s, "line", _drawable(points), **look)
 
 
 def entries_of(flights: Sequence[ViewedFlight]) -> Iterator[Entry]:
-    """Yield the entries of the world and of one or more flights, in the order of their stamps."""
+    """Yield the entries of one or more flights and of their common world, in order of stamps."""
     streams: list[Iterable[Entry]] = [_world(flights[0].run.record)]
     for flight in flights:
         streams += [_plans(flight), _notes(flight), *(_marks(flight, kind) for kind in _MARKED)]
@@ -151,7 +151,7 @@ def _marks(flight: ViewedFlight, kind: str) -> Iterator[Entry]:
 
 
 def _ticks(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
-    """Yield pose, setpoint and all states of each control tick."""
+    """Yield entries with the pose, the setpoint and all states of each control tick."""
     for row in trace.drop_columns(["phase"]).to_pylist():
         stamp_s = row.pop("stamp_s")
         position = np.array([row["x_m"], row["y_m"], row["z_m"]])
@@ -173,7 +173,7 @@ def _path(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
 
 
 def _drawable(points: FloatArray) -> FloatArray:
-    """Leave out the points (n, 3) that are not finite, and clip those that are very far away."""
+    """Return the finite ones of the points (n, 3), with coordinates clipped to _FARTHEST_M."""
     points = points.reshape(-1, 3)
     return points[np.isfinite(points).all(axis=1)].clip(-_FARTHEST_M, _FARTHEST_M)
 
@@ -193,7 +193,10 @@ def _clouds(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
 
 
 def _maps(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
-    """Yield every map used for a plan, and at most one checked map per second in between."""
+    """Yield each map used for planning, and the maps that were checked for collisions in between.
+
+    Of the checked maps, at most one is shown per second.
+    """
     planned = [(start_s, job[1], True) for job, start_s in orders.get("planner", ())]
     checked = [(at_s, job.snapshot, False) for job, at_s in orders.get("collision_check", ())]
     shown_s = -math.inf

@@ -59,8 +59,8 @@ _AXES = [
 def write_mcap(flights: Sequence[ViewedFlight], path: Path) -> None:
     """Write flights as an MCAP file, atomically. Equal flights give equal bytes.
 
-    The time of a message is that in the first flight's tlog: stamp 0 is EPOCH_UNIX_S or, for a
-    foreign autopilot, the Unix time at which its clock was 0.
+    Times are the same as in the first flight's tlog: stamp 0 is EPOCH_UNIX_S or, for a foreign
+    autopilot, the Unix time at which its clock was 0.
 
     Raises:
         RecordError: The file could not be written, or the tlog of a foreign flight could not be
@@ -95,7 +95,7 @@ def _write(
 
 
 def _metadata(flights: Sequence[ViewedFlight]) -> dict[str, Mapping[str, object]]:
-    """Return metadata records of an MCAP file, by name: missions, seeds, versions and faults."""
+    """Return the missions, seeds, versions and faults of flights as metadata records, by name."""
     records: dict[str, Mapping[str, object]] = {}
     for flight in flights:
         record = flight.run.record
@@ -109,7 +109,7 @@ def _metadata(flights: Sequence[ViewedFlight]) -> dict[str, Mapping[str, object]
 
 
 def write_layout(flights: Sequence[ViewedFlight], path: Path) -> None:
-    """Write a layout for Foxglove to import together with the file of these flights.
+    """Write a Foxglove layout that shows the MCAP file of these flights.
 
     Its panels show the world, the camera of the last flight, its events, and three plots of states.
 
@@ -200,7 +200,7 @@ def _schema(message: dict[str, Any]) -> bytes:
 
 
 def _messages(entry: Entry) -> Iterator[tuple[str, Message | dict[str, Any]]]:
-    """Yield the messages for an entry in an MCAP file, each with its topic."""
+    """Yield the Foxglove messages that show an entry, each with its topic."""
     topic, data, stamp = f"/{entry.path}", entry.data, _timestamp(entry)
     match entry.kind:
         case "boxes":
@@ -255,13 +255,17 @@ def _turn(quaternion: Sequence[float]) -> Quaternion:
 
 
 def _optical(quaternion: FloatArray) -> tuple[float, float, float, float]:
-    """Convert a camera's quaternion (4,) from x forward, y left to z forward, x right."""
+    """Convert a camera's attitude to the axes of an optical frame: z forward and x right.
+
+    Args:
+        quaternion: w, x, y, z of a frame with x forward and y left, (4,).
+    """
     w, x, y, z = (quaternion / 2.0).tolist()
     return w + x - y + z, x - w - y - z, w + x + y - z, x - w + y + z
 
 
 def _scene(entry: Entry, **primitives: Any) -> SceneUpdate:
-    """Return the scene of an entry's primitives. It replaces the previous one at the same path."""
+    """Return a scene with an entry's primitives, which replaces the last scene at the same path."""
     entity = SceneEntity(timestamp=_timestamp(entry), frame_id=_WORLD, id=entry.path, **primitives)
     return SceneUpdate(entities=[entity])
 
@@ -296,7 +300,7 @@ def _cloud(entry: Entry) -> PointCloud:
 
 
 def _camera(entry: Entry) -> Iterator[tuple[str, Message]]:
-    """Yield the pose of the optical frame, the camera's calibration, and the depth image in m."""
+    """Yield messages with the camera's optical frame, its calibration, and the depth image in m."""
     frame, stamp = entry.data, _timestamp(entry)
     name = entry.path
     rows, columns = frame.depth_m.shape

@@ -28,7 +28,7 @@ _VEHICLE = {  # plots of columns that are not states
 
 
 def write_rrd(flights: Sequence[ViewedFlight], path: Path | None) -> None:
-    """Write flights as an .rrd file, atomically, or open them in rerun's viewer.
+    """Write flights to an .rrd file, atomically, or open them in rerun's viewer if `path` is None.
 
     Raises:
         RecordError: The file could not be written.
@@ -62,10 +62,11 @@ def _log(recording: Any, flights: Sequence[ViewedFlight]) -> None:
 def _log_entries(
     recording: Any, entries: Iterable[Entry], drawn: Mapping[str, ViewedFlight]
 ) -> None:
-    """Log entries one by one; the numbers of all ticks follow at the end, column by column.
+    """Log all entries one by one, except the numbers of ticks, which follow column by column.
 
     Args:
-        drawn: The flight for each path of numbers; it determines colour and width of the lines.
+        drawn: The flight whose numbers are logged at each path. It determines the colour and the
+            width of their lines.
     """
     numbers: dict[str, list[Entry]] = {}
     for entry in entries:
@@ -92,7 +93,7 @@ def _log_entries(
 
 
 def _archetypes(entry: Entry) -> Iterator[tuple[str, Any]]:
-    """Yield the parts of an entry that rerun logs, each with its path."""
+    """Yield the rerun archetypes that show an entry, each with its path."""
     data, colours = entry.data, [to_rgb(entry.colour)] if entry.colour else None
     archetype: Any
     match entry.kind:
@@ -119,7 +120,10 @@ def _archetypes(entry: Entry) -> Iterator[tuple[str, Any]]:
 
 
 def _camera(entry: Entry) -> Iterator[tuple[str, Any]]:
-    """Yield the camera's pose, its lens, and its depth image; unmeasured pixels are 0."""
+    """Yield the camera's pose, its pinhole model, and the depth image, each with its path.
+
+    Pixels without a measurement are 0.
+    """
     frame = entry.data
     rows, columns = frame.depth_m.shape
     w, x, y, z = frame.quaternion
@@ -139,7 +143,11 @@ def _camera(entry: Entry) -> Iterator[tuple[str, Any]]:
 
 
 def _blueprint(flights: Sequence[ViewedFlight]) -> Any:
-    """Return the layout: world, cameras and events on the left, a tab of plots per stage."""
+    """Return the layout of rerun's window.
+
+    World, cameras and events are on the left. On the right is a tab of plots for each stage, and
+    one for the vehicle.
+    """
     names = [flight.name for flight in flights]
 
     def plots(groups: dict[str, Sequence[str]]) -> list[Any]:
@@ -169,7 +177,10 @@ def _blueprint(flights: Sequence[ViewedFlight]) -> Any:
 
 
 def _eye(flight: ViewedFlight) -> Any:
-    """Return a view of the middle of the route from the south-west and above; None without one."""
+    """Return a view from above and the south-west of the middle between start and goal.
+
+    Return None if the start or the goal is unknown.
+    """
     record = flight.run.record
     start, goal = record.world.get("start"), record.goal_enu_m
     if start is None or goal is None:

@@ -137,8 +137,8 @@ def test_runs_of_other_code_are_not_replayed(control_copy):
         ("corruption", {"register": "x"}, "it has no corruption.site"),
         ("injection", "theirs", "injection: must be a table"),
         ("input", "theirs", "input: must be a whole number"),
-        ("input", 99, "a run has no input 99"),
-        ("run", [0], "holds no repeatable runs"),  # the line is skipped, as an incomplete one is
+        ("input", 99, "a run has an unknown input number, 99"),
+        ("run", [0], "holds no run that can be repeated"),  # skipped as an incomplete line is
     ],
 )
 def test_a_damaged_run_is_not_replayed(name, value, problem, control_copy):

@@ -37,14 +37,14 @@ def _program(path: Path, text: str) -> Path:
 
 
 def test_a_path_without_a_file(tmp_path: Path) -> None:
-    with pytest.raises(VehicleProcessError, match="no firmware at"):
+    with pytest.raises(VehicleProcessError, match="is not a file"):
         _open("px4", tmp_path / "px4")
 
 
 def test_a_file_that_must_not_be_executed(tmp_path: Path) -> None:
     path = tmp_path / "px4"
     path.write_text("")
-    with pytest.raises(VehicleProcessError, match="no permission to execute"):
+    with pytest.raises(VehicleProcessError, match="is not executable"):
         _open("px4", path)
 
 

@@ -158,7 +158,7 @@ def test_bounds_that_bound_nothing_are_refused(yard: Path, bounds: str) -> None:
 
 def test_a_scene_without_room_says_so(yard: Path) -> None:
     yard.write_text(YARD.replace("start_enu_m = [0, 0, 0]\n", "").replace("20, 20, 5", "15, 15, 5"))
-    with pytest.raises(WorldError, match="no clear start and goal"):
+    with pytest.raises(WorldError, match="found no start and goal"):
         load_world(str(yard), seed=0)
 
 
