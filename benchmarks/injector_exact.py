@@ -136,7 +136,7 @@ def counted(place: Any, address: int) -> int:
     """Executions of an instruction in one undisturbed run, before its end is written."""
     tracee = place.start()
     try:
-        return tracee.count_to_end(address)
+        return tracee.count_to_end(address)[0]
     finally:
         tracee.kill()
 

@@ -208,7 +208,7 @@ class SetpointGate:
         self.outbox.append(self._codec.encode(command))
 
     def _record(self, alarm: Alarm, now_s: float, action: str) -> None:
-        states = [foreign_name(name) for name in alarm.states]
+        states = [_foreign_name(name) for name in alarm.states]
         if len(self._counts.alarms) < _MOST_ALARMS:
             self._counts.alarms.append(
                 {
@@ -252,6 +252,6 @@ class SetpointGate:
         }
 
 
-def foreign_name(name: str) -> str:
+def _foreign_name(name: str) -> str:
     """Return the name of a detector's input in a foreign companion; see `setpoints`."""
     return name.replace("waypoint_", "state_").replace("command_", "setpoint_")
