@@ -142,7 +142,7 @@ def counted(place: Any, address: int) -> int:
     """Return how often an instruction executes in one undisturbed run."""
     tracee = place.start()
     try:
-        return tracee.count_to_end(address)
+        return tracee.count_to_end(address)[0]
     finally:
         tracee.kill()
 

@@ -36,7 +36,7 @@ import numpy as np
 from mavfi_cli.attack.campaign import one_processor
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelTarget
-from mavfi_cli.attack.profile import detour_of
+from mavfi_cli.attack.profile import count_markers
 from mavfi_cli.fi.tracer.counted import Detour
 from mavfi_cli.fi.tracer.inject import instruction_at
 from mavfi_cli.fi.tracer.tracee import ExecutionCounter, Tracee
@@ -99,9 +99,7 @@ def measure(name: str, inputs: Path, rounds: int) -> None:
     """Measure one kernel in all ways, and print its row of the table."""
     target = KernelTarget(kernel=name, inputs=inputs)
     with one_processor(), closing(target.open()) as place:
-        tracee = place.start()
-        entries = tracee.count_to_end(place.image(tracee).address(place.kernel_scope.entry))
-        detour = detour_of(place, place.kernel_scope.entry)
+        ((entries, detour),) = count_markers(place, [place.kernel_scope.entry])
         spent: dict[str, list[float]] = {way: [] for way in WAYS}
         for number in range(rounds):
             for way in WAYS if number % 2 else reversed(WAYS):

@@ -255,6 +255,30 @@ __attribute__((noinline)) long victim(void) {
     long r; __asm__ volatile("mov $7, %%r10\\n\\tmov %%r10, %0" : "=r"(r) :: "r10"); return r;
 }
 int main(void) { printf("%ld\\n", victim()); return 0; }""",
+    # Every conditional jump, near and far, with every value of the flags that it depends on.
+    "jumps": r"""
+#include <stdio.h>
+#define JUMP(condition, distance) \
+    "push %[flags]\n\tpopfq\n\t" distance " j" condition " 1f\n\tinc %[n]\n" \
+    "1:\n\tlea (%[n], %[n], 2), %[n]\n\t"
+#define BOTH(condition) JUMP(condition, "%{disp8%}") JUMP(condition, "%{disp32%}")
+unsigned long taken(unsigned long flags, unsigned long n) {
+    __asm__ volatile("sub $128, %%rsp\n\t"
+        BOTH("o") BOTH("no") BOTH("b") BOTH("ae") BOTH("e") BOTH("ne") BOTH("be") BOTH("a")
+        BOTH("s") BOTH("ns") BOTH("p") BOTH("np") BOTH("l") BOTH("ge") BOTH("le") BOTH("g")
+        "mov $3, %%ecx\n2:\n\tinc %[n]\n\tloop 2b\n\tjrcxz 3f\n\tinc %[n]\n3:\n\t"
+        "lea 4f(%%rip), %%rcx\n\tjmp *%%rcx\n4:\n\t%{disp32%} jmp 5f\n5:\n\tsub $-128, %%rsp"
+        : [n] "+r"(n) : [flags] "r"(flags | 2) : "rcx", "cc", "memory");
+    return n;
+}
+int main(void) {
+    unsigned long n = 1;
+    for (int bits = 0; bits < 32; bits++)
+        n = taken((bits & 1) | (bits & 2) << 1 | (bits & 4) << 4 | (bits & 8) << 4
+                  | (bits & 16) << 7, n);
+    printf("%lx\n", n);
+    return 0;
+}""",
     # One labelled instruction of each kind whose destination must not be lost.
     "destinations": r"""
 #include <stdio.h>

@@ -134,7 +134,7 @@ def read_runs(folder: Path) -> list[FaultRecord]:
     if not path.is_file():
         return []
     with writing(path):
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_bytes().splitlines()
     runs: dict[tuple[str | None, int], FaultRecord] = {}
     for line in lines:
         with contextlib.suppress(AttributeError, KeyError, RecursionError, TypeError, ValueError):

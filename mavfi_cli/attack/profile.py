@@ -231,8 +231,9 @@ def profile_run(
     limit: int = STEPS,
     watch: Watch | None = None,
     guard: Guard = nullcontext,
+    reads_own_code: bool = True,
 ) -> TargetProfile:
-    """Profile a golden run by single-stepping all of it, or a sample of its windows.
+    """Profile a golden run by stepping all of it, or a sample of its windows.
 
     Args:
         markers: instructions in scope, each of which begins a window; empty to step the whole run.
@@ -241,6 +242,7 @@ def profile_run(
         enough: number of instructions to step per marker. The pilot determines how many windows
             that is.
         guard: creates the context in which a run is stepped.
+        reads_own_code: as for `record_window`.
 
     Raises:
         TargetError: no instruction in scope executes, or the run is not repeatable.
@@ -248,10 +250,11 @@ def profile_run(
     """
     begun = time.perf_counter()
     ends = (*markers, *([end] if end else []))
-    strata = [_Stepper(place, None, ends, limit, watch, guard).step(_FIRST, 1)]
-    for marker in markers:
-        stepper = _Stepper(place, marker, ends, limit, watch, guard, detour_of(place, marker))
-        pilot, others = np.split(rng.permutation(stepper.count()) + 1, [max(1, windows // 2)])
+    first = _Stepper(place, None, ends, limit, watch, guard, reads_own_code=reads_own_code)
+    strata = [first.step(_FIRST, 1)]
+    for marker, (count, detour) in zip(markers, count_markers(place, markers), strict=True):
+        stepper = replace(first, marker=marker, detour=detour)
+        pilot, others = np.split(rng.permutation(count) + 1, [max(1, windows // 2)])
         if not len(pilot):
             continue
         known = stepper.step(pilot, len(pilot))
@@ -268,14 +271,20 @@ def profile_run(
     return _profile(place, strata, begun)
 
 
-def profile_call(place: AttackPlace, *, limit: int = STEPS) -> TargetProfile:
-    """Profile a function by single-stepping one call of it. Runs of `place` start at its entry.
+def profile_call(
+    place: AttackPlace, *, limit: int = STEPS, reads_own_code: bool = True
+) -> TargetProfile:
+    """Profile a function by stepping one call of it. Runs of `place` start at its entry.
+
+    Args:
+        reads_own_code: as for `record_window`.
 
     Raises:
         WindowTooLong: the call executes more than `limit` instructions in scope.
     """
     begun = time.perf_counter()
-    return _profile(place, [_Stepper(place, None, None, limit).step(_FIRST, 1)], begun)
+    stepper = _Stepper(place, None, None, limit, reads_own_code=reads_own_code)
+    return _profile(place, [stepper.step(_FIRST, 1)], begun)
 
 
 def profile_calls(
@@ -287,20 +296,25 @@ def profile_calls(
     limit: int = STEPS,
     watch: Watch | None = None,
     guard: Guard = nullcontext,
+    reads_own_code: bool = True,
 ) -> TargetProfile:
     """Profile one of the functions, drawn in proportion to its calls, by stepping some calls.
 
     Args:
         windows: largest number of calls to step.
         guard: creates the context in which a run is stepped.
+        reads_own_code: as for `record_window`.
 
     Raises:
         WindowTooLong: a call executes more than `limit` instructions in scope.
         TargetError: none of the functions is ever called.
     """
     begun = time.perf_counter()
-    steppers = [_Stepper(place, entry, None, limit, watch, guard) for entry in functions]
-    counts = [stepper.count() for stepper in steppers]
+    steppers = [
+        _Stepper(place, entry, None, limit, watch, guard, reads_own_code=reads_own_code)
+        for entry in functions
+    ]
+    counts = [count for count, _ in count_markers(place, functions)]
     if not any(counts):
         with started(place) as tracee:
             image = place.image(tracee)
@@ -421,17 +435,33 @@ def function_of(place: AttackPlace, name: str) -> Location:
         return image.function(name, place.scope(image).objects)
 
 
-def detour_of(place: AttackPlace, marker: Location) -> Detour | None:
-    """Return a detour that can count the executions of `marker`, or None if no detour fits."""
+def count_markers(
+    place: AttackPlace, markers: Sequence[Location]
+) -> list[tuple[int, Detour | None]]:
+    """Count the executions of markers in a whole run, and find a detour that counts each of them.
+
+    Returns:
+        The number of executions of each marker, and its detour; None if no detour fits there.
+    """
+    if not markers:
+        return []
     with started(place) as tracee:
-        address = place.image(tracee).address(marker)
-        code = tracee.memory.read(address, _DETOUR_CODE)
+        image, at_once = place.image(tracee), tracee.mechanism.counters
+        starts = [image.address(marker) for marker in markers]
+        code = {start: tracee.memory.read(start, _DETOUR_CODE) for start in starts}
+    wanted: dict[int, int] = {}
 
-    def executions(address: int) -> int:
+    def detour(start: int, executions: Callable[[int], int]) -> Detour | None:
+        return Detour.at(start, lambda at: code[start][at - start :][:16], executions)
+
+    for start in starts:  # a first pass notes whose executions decide
+        wanted[start] = 0
+        detour(start, lambda address: wanted.setdefault(address, 0))
+    addresses = sorted(wanted)
+    for portion in (addresses[at : at + at_once] for at in range(0, len(addresses), at_once)):
         with started(place) as tracee:
-            return tracee.count_to_end(address)
-
-    return Detour.at(address, lambda at: code[at - address :][:16], executions)
+            wanted.update(zip(portion, tracee.count_to_end(*portion), strict=True))
+    return [(wanted[start], detour(start, wanted.__getitem__)) for start in starts]
 
 
 @contextmanager
@@ -478,12 +508,7 @@ class _Stepper:
     watch: Watch | None = None
     guard: Guard = nullcontext
     detour: Detour | None = None  # at the marker
-
-    def count(self) -> int:
-        """Count the windows of a run that begin at the marker."""
-        assert self.marker is not None
-        with started(self.place) as tracee:
-            return tracee.count_to_end(self.place.image(tracee).address(self.marker))
+    reads_own_code: bool = True
 
     def step(self, numbers: NDArray[np.int64], count: int) -> Stratum:
         """Step the windows with the given numbers, counted from 1, and return them as a stratum.
@@ -524,6 +549,7 @@ class _Stepper:
                     until_return=self.markers is None,
                     markers=[image.address(marker) for marker in self.markers or ()],
                     watch=self.watch,
+                    reads_own_code=self.reads_own_code,
                 )
                 passed = number + int(np.count_nonzero(trace == address)) - 1
                 yield Segment(start=start, trace=trace)

@@ -417,6 +417,7 @@ def _recorded_fault(run: Path, companion: str | None) -> InstructionConfig:
         UsageError: an option conflicts with --replay, or --companion is missing.
     """
     from mavfi_cli.core.config import structure
+    from mavfi_cli.fi.tracer.record import fault_of
     from mavfi_cli.spec.companion import CompanionConfig
     from mavfi_cli.spec.fault import InstructionConfig
 
@@ -426,7 +427,10 @@ def _recorded_fault(run: Path, companion: str | None) -> InstructionConfig:
         raise click.UsageError(
             "--replay needs --companion; to repeat a flight without it, use `mavfi replay`"
         )
-    fault = structure(_record_of(run).get("request") or {}, InstructionConfig)
+    recorded = _record_of(run)
+    if recorded["trigger"]:
+        fault_of(recorded)  # refuses a damaged record
+    fault = structure(recorded.get("request") or {}, InstructionConfig)
     fault.check_program(CompanionConfig.load(companion).program)
     return fault
 

@@ -28,6 +28,7 @@ from mavfi_cli.core.errors import RecordError, lack_of
 
 Json = dict[str, Any]  # a JSON object, as plain values
 _LARGEST = 1 << 32  # largest table, bytes
+_DEEPEST = 64  # levels of nested values in a JSON file
 _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
@@ -98,6 +99,16 @@ def read_json(path: Path, limit: int) -> Json:
         value = json.loads(read_bounded(path, limit))
     if not isinstance(value, dict):
         raise RecordError(f"{path}: not a JSON object")
+    level: list[Any] = [value]
+    for _ in range(_DEEPEST):
+        level = [
+            part
+            for parts in level
+            for part in (parts.values() if isinstance(parts, dict) else parts)
+            if isinstance(part, (dict, list))
+        ]
+    if level:
+        raise RecordError(f"{path}: its values are nested more than {_DEEPEST} deep")
     return value
 
 

@@ -220,7 +220,7 @@ class SetpointGate:
         self.outbox.append(self._codec.encode(command))
 
     def _record(self, alarm: Alarm, now_s: float, action: str) -> None:
-        states = [foreign_name(name) for name in alarm.states]
+        states = [_foreign_name(name) for name in alarm.states]
         if len(self._counts.alarms) < _MOST_ALARMS:
             self._counts.alarms.append(
                 {
@@ -264,7 +264,7 @@ class SetpointGate:
         }
 
 
-def foreign_name(name: str) -> str:
+def _foreign_name(name: str) -> str:
     """Rename a detector's input for a user's companion, such as `waypoint_x` to `state_x`.
 
     There, the inputs have another meaning, which the module `setpoints` describes.

@@ -181,7 +181,7 @@ def test_bootstrap_intervals_are_efrons(statistic, oracle):
 
 def test_weights_are_refused_for_another_statistic_than_the_mean():
     values, weights = np.arange(9.0), np.arange(1.0, 10.0)
-    with pytest.raises(ValueError, match="need the mean"):
+    with pytest.raises(ValueError, match="with the mean only"):
         interval(values, median, resamples=99, weights=weights)
     found = interval(values, resamples=99, weights=weights)
     assert found.value == np.average(values, None, weights)

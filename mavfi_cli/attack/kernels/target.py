@@ -168,6 +168,7 @@ class _KernelPlace:
             windows=max(4, windows // len(self.inputs)),
             limit=self.limits.profile_steps,
             watch=watch,
+            reads_own_code=False,
         )
 
     def fault_free(self) -> Golden:

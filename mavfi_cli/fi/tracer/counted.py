@@ -38,7 +38,7 @@ _JUMP_BYTES, _SHORT_JUMP_BYTES = 5, 2
 _SHORT_JUMP = range(-126, 130)  # reach of a short jump, from its own address
 _PAGE = 4096
 _SAVED, _COUNTER, _RETURN = 0, 8, 16  # offsets in the data page
-_FIXED = frozenset(("syscall", "sysenter", "int", "int3", "hlt", "ud2", "xbegin", "xabort", "xend"))
+FIXED = frozenset(("syscall", "sysenter", "int", "int3", "hlt", "ud2", "xbegin", "xabort", "xend"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,7 +158,7 @@ def _flow(code: bytes, address: int) -> _Flow | None:
     leaves = not BRANCHES.isdisjoint(decoded.groups)
     return _Flow(
         size=decoded.size,
-        straight=not leaves and decoded.mnemonic not in _FIXED,
+        straight=not leaves and decoded.mnemonic not in FIXED,
         movable=_moved(decoded, address, address) is not None,
         repeated=decoded.mnemonic.startswith("rep") and not leaves,
     )
@@ -179,7 +179,7 @@ def _moved(decoded: Any, at: int, return_slot: int) -> bytes | None:
     `return_slot` is the address at which a moved call finds its return address.
     """
     raw = bytes(decoded.bytes)
-    if decoded.mnemonic in _FIXED:
+    if decoded.mnemonic in FIXED:
         return None
     immediate = bool(decoded.operands) and decoded.operands[0].type == x86.X86_OP_IMM
     if decoded.group(x86.X86_GRP_CALL):
@@ -187,7 +187,7 @@ def _moved(decoded: Any, at: int, return_slot: int) -> bytes | None:
             return None
         push = b"\xff\x35" + struct.pack("<i", return_slot - at - 6)  # the true return address
         return push + _jump(decoded.operands[0].imm, at + 6)
-    if decoded.group(x86.X86_GRP_JUMP) and immediate:
+    if decoded.group(x86.X86_GRP_BRANCH_RELATIVE) and immediate:
         target = decoded.operands[0].imm
         first, second = decoded.opcode[0], decoded.opcode[1]
         if first in (0xE9, 0xEB):

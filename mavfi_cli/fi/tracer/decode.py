@@ -32,7 +32,10 @@ from mavfi_cli.fi.tracer.vectors import (
 
 engine: Any = capstone.Cs(capstone.CS_ARCH_X86, capstone.CS_MODE_64)
 engine.detail = True
-BRANCHES = {x86.X86_GRP_JUMP, x86.X86_GRP_CALL, x86.X86_GRP_RET, x86.X86_GRP_IRET}
+BRANCHES = {
+    x86.X86_GRP_JUMP, x86.X86_GRP_CALL, x86.X86_GRP_RET, x86.X86_GRP_IRET,
+    x86.X86_GRP_BRANCH_RELATIVE,  # the only group of `loop`
+}  # fmt: skip
 _FULL = low(64)
 GENERAL = (
     "rax", "rbx", "rcx", "rdx", "rsi", "rdi", "rbp", "rsp", "r8", "r9", "r10", "r11", "r12", "r13",

@@ -267,7 +267,7 @@ class ProcessTimer:
 
     def _watch(self) -> None:
         while (left := self._left_s()) > 0:
-            if self._cancelled.wait(max(left, _SHORTEST_WAIT_S)):
+            if self._cancelled.wait(min(max(left, _SHORTEST_WAIT_S), threading.TIMEOUT_MAX)):
                 return
         self.fired = True
         try:

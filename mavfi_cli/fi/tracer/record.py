@@ -17,6 +17,7 @@ from mavfi_cli.core.errors import BuildMismatch, RecordError
 from mavfi_cli.core.files import Json, read_json, write_text
 from mavfi_cli.core.flight_record import SCHEMA
 from mavfi_cli.fi.tracer.counted import CountedStop, Detour
+from mavfi_cli.fi.tracer.decode import decode
 from mavfi_cli.fi.tracer.fault import (
     InstructionCorruption,
     InstructionFault,
@@ -31,6 +32,7 @@ VERSION = 2  # version 1 had whole registers as operands
 _LARGEST = 1 << 24  # bytes of a record
 _LARGEST_OFFSET, _LARGEST_COUNT = 1 << 40, 1 << 48
 _LONGEST_DETOUR = 127  # bytes
+_SHORT_JUMP = -126, 129  # reach of a two-byte jump from its own address
 _WIDEST_OPERAND, _MOST_OPERANDS = 8192, 8  # bits of an opcode or in memory; memory operands
 
 
@@ -156,7 +158,7 @@ class _Stage:
         _require_range("count", self.count, 1, _LARGEST_COUNT)
         if self.detour is not None:
             _require_range("detour.size", self.detour.size, 1, _LONGEST_DETOUR)
-            _require_range("detour.via", abs(self.detour.via), 0, _LONGEST_DETOUR)
+            _require_range("detour.via", self.detour.via, *_SHORT_JUMP)
         return CountedStop(Location(self.object, self.offset), self.count, self.detour)
 
 
@@ -220,11 +222,16 @@ def fault_of(record: FaultRecord) -> InstructionFault:
     """
     read = _Repeatable.of(record)
     try:
+        code = bytes.fromhex(read.instruction_bytes)
+        if read.corruption is not None and read.corruption.site is Site.MEMORY:
+            instruction = decode(code, 0)
+            if instruction is None or read.corruption.memory_operand >= len(instruction.memory):
+                raise ValueError("its instruction has no such memory operand")
         return InstructionFault(
             trigger=tuple(stage.stop() for stage in read.trigger),
             execution=read.k,
             instruction=read.instruction,
-            instruction_bytes=bytes.fromhex(read.instruction_bytes),
+            instruction_bytes=code,
             corruption=read.corruption,
         )
     except ValueError as error:
@@ -235,17 +242,24 @@ def require_same_build(record: FaultRecord, image: Image) -> None:
     """Raise an error if an object that a record names is not loaded or is from another build.
 
     Raises:
-        BuildMismatch: an object is missing or of another build; the message names all such
-            objects.
+        BuildMismatch: an object is missing or of another build, or has no code at a stop of the
+            trigger; the message names all such objects.
         RecordError: the record is damaged or has another version.
     """
-    differences = []
-    for name, build_id in _Repeatable.of(record).build_ids.items():
-        loaded = image.find(name)
+    read, differences = _Repeatable.of(record), []
+    stops = [stage.stop().location for stage in read.trigger]
+    for name in {location.object: None for location in stops} | read.build_ids:
+        loaded, build_id = image.find(name), read.build_ids.get(name)
         if loaded is None:
             differences.append(f"{name} is not loaded")
         elif loaded.build_id != build_id:
             differences.append(f"{name} has build id {loaded.build_id}, not {build_id} as recorded")
+        elif not all(
+            any(location.offset in span for span in loaded.text)
+            for location in stops
+            if location.object == name
+        ):
+            differences.append(f"{name} has no code where the fault strikes")
     if differences:
         raise BuildMismatch(differences)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 
@@ -131,6 +131,7 @@ def record_window(
     until_return: bool = False,
     markers: Sequence[int] = (),
     watch: Callable[[int], None] | None = None,
+    reads_own_code: bool = True,
 ) -> NDArray[np.int64]:
     """Single-step one window of a run, and return the addresses that execute in scope, in order.
 
@@ -144,6 +145,8 @@ def record_window(
         markers: addresses in scope; the window ends before the next execution of any of them. It
             always contains the instruction at which the target is stopped.
         watch: called regularly with the number of instructions recorded since the last call.
+        reads_own_code: the target may read its own code, so it is single-stepped. Otherwise it runs
+            from breakpoint to breakpoint, which is several times faster.
 
     Raises:
         WindowTooLong: more than `limit` instructions in scope are executed.
@@ -157,34 +160,53 @@ def record_window(
         parts.append(np.array([tracee.registers.ip], np.int64))
         clean_step(tracee, instruction_at(tracee, tracee.registers.ip))
     total = len(parts)
-    for part in _parts(tracee, scope, stop):
-        parts.append(part)
-        total += len(part)
-        if watch is not None:
-            watch(len(part))
-        if total > limit:
-            raise WindowTooLong(program, limit)
+    with contextlib.closing(_parts(tracee, scope, stop, reads_own_code)) as recorded:
+        for part in recorded:
+            parts.append(part)
+            total += len(part)
+            if watch is not None:
+                watch(len(part))
+            if total > limit:
+                raise WindowTooLong(program, limit)
     return np.concatenate(parts) if parts else np.empty(0, np.int64)
 
 
-def _parts(tracee: Tracee, scope: Scope, stop: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+def _parts(
+    tracee: Tracee, scope: Scope, stop: NDArray[np.int64], reads_own_code: bool
+) -> Generator[NDArray[np.int64], None, None]:
     from mavfi_cli.fi.tracer import stepper  # numba takes half a second to import
 
-    spans, blanket = scope.bounds, _Blanket(tracee, scope)
-    while tracee.ended is None:
-        trace = np.empty(_CHUNK, np.int64)
-        tracee.registers.forget()
-        recorded, why, report = stepper.record_steps(tracee.tid, tracee.group, spans, trace, stop)
-        yield trace[:recorded]
-        if why == stepper.WINDOW_END:
-            return
-        if why == stepper.OTHER_STATUS:
-            tracee.handle(report, linux.SINGLESTEP)
-        elif why == stepper.NEEDS_CARE:
-            yield np.array([tracee.registers.ip], np.int64)
-            clean_step(tracee, instruction_at(tracee, tracee.registers.ip))
-        elif why == stepper.OUT_OF_SCOPE and not blanket.run_native(stop):
-            return
+    blanket, spans = _Blanket(tracee, scope), scope.bounds
+    ends = (int(stop[0]), *stop[2:].tolist())
+    blocks = None if reads_own_code else stepper.Blocks(blanket.code, ends)
+    try:
+        while tracee.ended is None:
+            trace, target = np.empty(_CHUNK, np.int64), (tracee.tid, tracee.group)
+            tracee.registers.forget()
+            if blocks is None:
+                recorded, why, report = stepper.record_steps(*target, spans, trace, stop)
+            else:
+                recorded, why, report = blocks.record(*target, trace, stop)
+            yield trace[:recorded]
+            if why == stepper.WINDOW_END:
+                return
+            if blocks is not None and why == stepper.NEW_BLOCK:
+                blocks.add(tracee.registers.ip)
+                continue
+            if blocks is not None and why != stepper.FULL:
+                if why != stepper.OUT_OF_SCOPE:  # `run_native` restores the code, too
+                    blanket.uncover()
+                blocks.forget_breakpoints()
+            if why == stepper.OTHER_STATUS:
+                tracee.handle(report, linux.SINGLESTEP)
+            elif why == stepper.NEEDS_CARE:
+                yield np.array([tracee.registers.ip], np.int64)
+                clean_step(tracee, instruction_at(tracee, tracee.registers.ip))
+            elif why == stepper.OUT_OF_SCOPE and not blanket.run_native(stop):
+                return
+    finally:
+        if blocks is not None:
+            blanket.uncover()
 
 
 class _Blanket:
@@ -192,7 +214,7 @@ class _Blanket:
 
     def __init__(self, tracee: Tracee, scope: Scope) -> None:
         self._tracee, self._scope = tracee, scope
-        self._code = {span.start: tracee.memory.read(span.start, len(span)) for span in scope.spans}
+        self.code = {span.start: tracee.memory.read(span.start, len(span)) for span in scope.spans}
 
     def run_native(self, stop: NDArray[np.int64]) -> bool:
         """Run natively up to code in scope. Return False if the program or function ends first."""
@@ -200,8 +222,8 @@ class _Blanket:
         with contextlib.ExitStack() as undo:
             if returns_to > 0 and returns_to not in self._scope:
                 undo.callback(tracee.breakpoint_at(returns_to).close)
-            undo.callback(self._uncover)
-            for start, code in self._code.items():
+            undo.callback(self.uncover)
+            for start, code in self.code.items():
                 tracee.memory.write(start, _BREAKPOINT * len(code))
             while tracee.resume() is None:
                 entered = registers.ip - len(_BREAKPOINT)
@@ -212,8 +234,9 @@ class _Blanket:
                     return False
             return False
 
-    def _uncover(self) -> None:
-        for start, code in self._code.items() if self._tracee.ended is None else ():
+    def uncover(self) -> None:
+        """Restore the code."""
+        for start, code in self.code.items() if self._tracee.ended is None else ():
             self._tracee.memory.write(start, code)
 
 

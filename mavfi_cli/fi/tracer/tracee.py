@@ -75,6 +75,11 @@ class Mechanism(Enum):
         """Return the best mechanism that this machine allows."""
         return cls.PERF if perf_allowed() is None else cls.DEBUG
 
+    @property
+    def counters(self) -> int:
+        """Largest number of addresses whose executions are counted in one run."""
+        return 4 if self is Mechanism.PERF else 1  # Intel SDM volume 3, section 18.2
+
 
 def _open_event(tid: int, address: int, period: int, *, inherited: bool = False) -> int:
     linux.require_supported()
@@ -401,19 +406,26 @@ class Tracee:
                 self.interrupt()
         return self.ended
 
-    def count_to_end(self, address: int) -> int:
-        """Run to the program's end, and count the executions of the instruction at `address`."""
+    def count_to_end(self, *addresses: int) -> list[int]:
+        """Run to the end of the program and count the executions of each address on the way.
+
+        Args:
+            addresses: at most as many as `Mechanism.counters`.
+        """
         self.registers.rearm()
-        if self.mechanism is Mechanism.PERF:
-            with contextlib.closing(ExecutionCounter(self.tid, address)) as counter:
+        with contextlib.ExitStack() as open_ones:
+            if self.mechanism is Mechanism.PERF:
+                counters = [ExecutionCounter(self.tid, address) for address in addresses]
+                for counter in counters:
+                    open_ones.callback(counter.close)
                 while self.resume() is None:
                     pass
-                return counter.read()
-        count = 0
-        with contextlib.closing(self.breakpoint_at(address)):
+                return [counter.read() for counter in counters]
+            (address,), count = addresses, 0
+            open_ones.callback(self.breakpoint_at(address).close)
             while self.resume() is None:
                 count += self.registers.ip == address
-        return count
+            return [count]
 
     def breakpoint_at(self, address: int, count: int = 1) -> ExecutionCounter | _DebugBreakpoint:
         """Set a breakpoint before execution `count` of the instruction at `address`.

@@ -35,12 +35,14 @@ from mavfi_cli.companion.injection import NoInjection, StruckNode
 from mavfi_cli.companion.kernels import ControlInput
 from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.core.archive import pack, unpack
+from mavfi_cli.core.config import structure_record
 from mavfi_cli.core.errors import FaultError, MavfiError, RecordError
 from mavfi_cli.core.files import (
     own_folder,
     read_bounded,
     write_atomically,
 )
+from mavfi_cli.core.flight_record import MissionInstructionFault
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import KERNELS, Briefing, DepthFrame, PointCloud
 from mavfi_cli.fi.tracer import record
@@ -421,6 +423,10 @@ class InstructionInjection(NoInjection):
         fault = record.fault_of(recorded)
         if missing := [name for name in _CONTEXT if name not in recorded]:
             raise RecordError(f"the fault record is damaged: it has no entry {missing[0]!r}")
+        try:
+            structure_record(recorded, MissionInstructionFault)
+        except ValueError as error:
+            raise RecordError(f"the fault record is damaged: {error}") from None
         context = {name: recorded.get(name) for name in _CONTEXT}
         return cls(fault, context, recorded=recorded, for_debugger=for_debugger)
 

@@ -50,7 +50,10 @@ from mavfi_cli.mission.instruction import PROGRAM
 
 Order = tuple[str, Any, float]  # node, input, start stamp
 _CREDENTIALS = "3i"  # struct ucred, unix(7): process, user, group
-_WHOLE_LIMIT = 600_000  # instructions of an invocation, or of one window
+_STEPPED: Any = {
+    "limit": 600_000,  # instructions of an invocation, or of one window
+    "reads_own_code": False,
+}
 _WINDOWS, _ENOUGH = 4, 50_000  # for a planner's request with a search: see `profile_run`
 _INNER_CALLS = {"octomap": 16}  # sampled calls of one inner function, about 300 instructions each
 
@@ -226,22 +229,22 @@ class Rehearsal:
     def _stepped(self, rng: np.random.Generator) -> TargetProfile:
         node, inner = self._node, self.scope_of_node.inner
         if node in _INNER_CALLS:
-            return profile_calls(self, rng, inner, windows=_INNER_CALLS[node], limit=_WHOLE_LIMIT)
+            return profile_calls(self, rng, inner, windows=_INNER_CALLS[node], **_STEPPED)
         if node != "planner":
-            return profile_call(self, limit=_WHOLE_LIMIT)
+            return profile_call(self, **_STEPPED)
         # No native function encloses a request: Python calls several compiled functions, and only
         # some requests need a search, which begins with the first of `inner`. So the request ends
         # with the run. It is stepped whole if it needs no search.
         tracee = self.start()
         try:
-            searches = tracee.count_to_end(self._image.address(inner[0])) > 0
+            searches = tracee.run_to(self._image.address(inner[0]))
         finally:
             tracee.kill()
         if not searches:
             with contextlib.suppress(WindowTooLong):  # smoothing may repeat its passes
-                return profile_run(self, rng, limit=_WHOLE_LIMIT)
+                return profile_run(self, rng, **_STEPPED)
         several: Any = {"markers": inner, "windows": _WINDOWS, "enough": _ENOUGH}
-        return profile_run(self, rng, **several, limit=_WHOLE_LIMIT)
+        return profile_run(self, rng, **several, **_STEPPED)
 
     # Strike
 

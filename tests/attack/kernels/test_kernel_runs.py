@@ -148,6 +148,12 @@ def test_a_damaged_run_is_not_replayed(name, value, problem, control_copy):
         list(replay_runs(control_copy, ("control",)))
 
 
+def test_a_run_that_is_not_utf_8_is_skipped_as_an_incomplete_one_is(control_copy):
+    path = control_copy / "runs.jsonl"
+    path.write_bytes(path.read_bytes().replace(b'"kernel": "control"', b'"kernel": "contr\xff"', 1))
+    assert len(list(replay_runs(control_copy, ("control",)))) == 29
+
+
 def test_nothing_to_replay_is_an_error(tmp_path):
     with pytest.raises(RecordError, match=r"plan\.json"):
         list(replay_runs(tmp_path))

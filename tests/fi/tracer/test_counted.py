@@ -108,3 +108,11 @@ def test_a_detour_that_does_not_fit_is_left_to_the_breakpoint(start):
     body = image.address(image.function("body", ["counting"]))
     assert tracee.run_to(body, 200, Detour(1))  # cuts an instruction
     assert tracee.registers.read("rdi") == 199
+
+
+def test_a_loop_instruction_is_not_relocated():
+    """Its jump reaches 127 bytes, so a copy elsewhere would jump to another place."""
+    increment, loop = b"\x48\xff\xc0", b"\xe2\xfb"
+    code = increment + loop
+    assert Detour(5).code(code, 0x401000, 0x501000, 3) is None
+    assert Detour.at(0x401000, lambda at: code[at - 0x401000 :], lambda _: 7) is None

@@ -31,7 +31,9 @@ SOUND = {
     "build_ids": {"libm.so.6": "ab12"},
     "injection": {"applied": True},
 }  # fmt: skip
-LOADED = SimpleNamespace(find=lambda name: SimpleNamespace(build_id="ab12"))
+LIBM = SimpleNamespace(build_id="ab12", text=(range(60, 100),))
+LOADED = SimpleNamespace(find=lambda name: LIBM if name == "libm.so.6" else None)
+MEMORY = SOUND["corruption"] | {"site": "memory", "register": ""}
 
 
 def test_a_sound_record_is_its_fault():
@@ -56,6 +58,7 @@ def test_a_sound_record_is_its_fault():
         (("trigger", 0, "count"), 0, "count must be between 1"),
         (("trigger", 0, "object"), [], r"object: must be text"),
         (("trigger", 0, "detour", "size"), 10**9, "size must be between 1 and 127"),
+        (("trigger", 0, "detour", "via"), 130, "via must be between -126 and 129"),
         (("instruction_bytes",), "no", "non-hexadecimal"),
         (("corruption", "site"), "soul", "site: 'soul'"),
         (("corruption", "register"), ..., "unknown register ''"),
@@ -63,6 +66,7 @@ def test_a_sound_record_is_its_fault():
         (("corruption", "bits"), "3", "bits: must be an array"),
         (("corruption", "bits", 0), 64, "bits must be between 0 and 63, got 64"),
         (("corruption", "memory_operand"), -1, "memory_operand must be between 0"),
+        (("corruption",), MEMORY, "its instruction has no such memory operand"),
         (("injection",), [], "injection: must be a table"),
         (("input",), "1", "input: must be a whole number"),
         (("version",), 1, "not a fault record of version"),
@@ -72,6 +76,30 @@ def test_a_damaged_record_is_refused(place, value, problem):
     damaged = changed(place, value)
     with pytest.raises(RecordError, match=problem):
         record.fault_of(damaged)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "problem"),
+    [
+        (("build_ids", "libm.so.6"), "cd34", "has build id ab12, not cd34 as recorded"),
+        (("build_ids",), {}, "has build id ab12, not None as recorded"),
+        (("build_ids", "libc.so.6"), "cd34", r"libc\.so\.6 is not loaded"),
+        (("trigger", 1, "object"), "libc.so.6", r"libc\.so\.6 is not loaded"),
+        (("trigger", 1, "offset"), 100, r"libm\.so\.6 has no code where the fault strikes"),
+        (("trigger", 0, "offset"), 1 << 40, r"libm\.so\.6 has no code where the fault strikes"),
+    ],
+)
+def test_a_record_of_other_code_is_refused(place, value, problem):
+    with pytest.raises(BuildMismatch, match=problem):
+        record.require_same_build(changed(place, value), LOADED)
+
+
+def test_a_record_nested_too_deeply_is_refused(tmp_path):
+    path = tmp_path / "fault.json"
+    for depth, problem in ((900, "nested more than 64 deep"), (100_000, "damaged")):
+        path.write_text(json.dumps(SOUND)[:-1] + f', "windows": {"[" * depth}{"]" * depth}}}')
+        with pytest.raises(RecordError, match=problem):
+            record.read(path)
 
 
 def changed(place, value):

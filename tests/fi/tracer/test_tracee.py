@@ -92,6 +92,14 @@ def test_a_timer_may_kill_a_program_that_is_stopped(start):
     assert tracee.resume() == Ended(exit_code=None, signal=signal.SIGKILL)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_limit_that_is_never_reached_does_not_end_the_timer(start):
+    tracee = start("sleeper")
+    with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=1e18) as alarm:
+        time.sleep(0.05)
+        assert alarm._thread.is_alive()
+
+
 def test_a_limit_of_cpu_time_allows_for_threads_on_every_processor(start, monkeypatch):
     monkeypatch.setattr(linux.os, "cpu_count", lambda: 4)
     tracee = start("counting")  # stopped, so it uses no CPU time

@@ -19,11 +19,12 @@ from mavfi_cli.fi.tracer.sampling import (
 from mavfi_cli.fi.tracer.tracee import ExecutionCounter, Mechanism
 
 
-def profile_of(start, name, *arguments, limit=100_000):
+def profile_of(start, name, *arguments, limit=100_000, reads_own_code=True):
     tracee = start(name, *arguments)
     image = Image(tracee.pid)
     scope = image.scope([name])
-    return record_window(tracee, scope, limit=limit, program=name), image, scope
+    trace = record_window(tracee, scope, limit=limit, program=name, reads_own_code=reads_own_code)
+    return trace, image, scope
 
 
 def whole(trace):
@@ -44,9 +45,10 @@ def stepped_in_python(start, name, *arguments):
             return trace
 
 
-@pytest.mark.parametrize("name", ["sorting", "destinations"])
-def test_the_profile_equals_stepping_everything(start, tmp_path, name):
-    trace, _, _ = profile_of(start, name)
+@pytest.mark.parametrize("reads_own_code", [True, False])
+@pytest.mark.parametrize("name", ["sorting", "destinations", "jumps"])
+def test_the_profile_equals_stepping_everything(start, tmp_path, name, reads_own_code):
+    trace, _, _ = profile_of(start, name, reads_own_code=reads_own_code)
     output = (tmp_path / "stdout").read_text()
     assert trace.tolist() == stepped_in_python(start, name)
     assert (tmp_path / "stdout").read_text() == output != ""
@@ -67,14 +69,16 @@ def test_counts_equal_the_kernels_own(start):
         counter.close()
 
 
-def test_a_function_window_ends_with_its_return(start):
+@pytest.mark.parametrize("reads_own_code", [True, False])
+def test_a_function_window_ends_with_its_return(start, reads_own_code):
     tracee = start("counting", "50")
     image = Image(tracee.pid)
     body = image.address(image.function("body", ["counting"]))
     assert tracee.run_to(body, 7)
     window = record_window(
-        tracee, image.scope(["counting"]), limit=1000, program="", until_return=True
-    )
+        tracee, image.scope(["counting"]), limit=1000, program="", until_return=True,
+        reads_own_code=reads_own_code,
+    )  # fmt: skip
     assert window[0] == body
     assert (window == body).sum() == 1
     assert image.symbol(image.locate(tracee.registers.ip)).startswith("main+")
@@ -82,15 +86,17 @@ def test_a_function_window_ends_with_its_return(start):
     assert tracee.registers.read("rdi") == 7
 
 
+@pytest.mark.parametrize("reads_own_code", [True, False])
 @pytest.mark.parametrize("mechanism", list(Mechanism))
-def test_a_function_called_from_foreign_code_ends_there_too(start, mechanism):
+def test_a_function_called_from_foreign_code_ends_there_too(start, mechanism, reads_own_code):
     tracee = start("sorting", mechanism=mechanism)
     image = Image(tracee.pid)
     compare = image.address(image.function("compare", ["sorting"]))
     assert tracee.run_to(compare, 2)
     window = record_window(
-        tracee, image.scope(["sorting"]), limit=1000, program="", until_return=True
-    )
+        tracee, image.scope(["sorting"]), limit=1000, program="", until_return=True,
+        reads_own_code=reads_own_code,
+    )  # fmt: skip
     assert window[0] == compare
     assert image.locate(tracee.registers.ip).object.startswith("libc")
     assert tracee.run_to(compare, 1)
@@ -115,7 +121,9 @@ def test_every_trigger_stops_before_its_execution(start, name, arguments):
         for stage in trigger:
             assert tracee.run_to(image.address(stage.location), stage.count, stage.detour)
         detours += any(stage.detour is not None for stage in trigger)
-        rest = record_window(tracee, image.scope([name]), limit=100_000, program=name)
+        rest = record_window(
+            tracee, image.scope([name]), limit=100_000, program=name, reads_own_code=False
+        )
         assert np.array_equal(rest, trace[index:])
     assert detours > 4
 
