@@ -246,10 +246,10 @@ def require_same_build(record: FaultRecord, image: Image) -> None:
             trigger; the message names all such objects.
         RecordError: the record is damaged or has another version.
     """
-    read, differences = _Repeatable.of(record), []
-    stops = [stage.stop().location for stage in read.trigger]
-    for name in {location.object: None for location in stops} | read.build_ids:
-        loaded, build_id = image.find(name), read.build_ids.get(name)
+    stops = [stop.location for stop in fault_of(record).trigger]
+    build_ids, differences = _Repeatable.of(record).build_ids, []
+    for name in {location.object: None for location in stops} | build_ids:
+        loaded, build_id = image.find(name), build_ids.get(name)
         if loaded is None:
             differences.append(f"{name} is not loaded")
         elif loaded.build_id != build_id:

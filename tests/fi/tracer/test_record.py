@@ -76,6 +76,8 @@ def test_a_damaged_record_is_refused(place, value, problem):
     damaged = changed(place, value)
     with pytest.raises(RecordError, match=problem):
         record.fault_of(damaged)
+    with pytest.raises(RecordError, match=problem):
+        record.require_same_build(damaged, LOADED)
 
 
 @pytest.mark.parametrize(
