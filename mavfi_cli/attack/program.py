@@ -125,7 +125,7 @@ class ProgramTarget:
         return entries
 
     def open(self) -> _Workplace:
-        """Create a scratch folder for the program's runs, and return the place that uses it."""
+        """Create a scratch folder, and return the `AttackPlace` whose runs use that folder."""
         return _Workplace(self)
 
 

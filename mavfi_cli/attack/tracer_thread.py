@@ -41,7 +41,7 @@ class TracerThread(Generic[T]):
         threading.Thread(target=run, daemon=True).start()
 
     def await_armed(self) -> None:
-        """Wait until the node runs towards the awaited event, or raise the error of the work."""
+        """Wait until the fault is armed in the running node, or raise the tracer thread's error."""
         self._armed.wait()
         if self._done.done():
             self._done.result()

@@ -226,7 +226,7 @@ class Gate:
         return self._settled(trajectory, alarm)
 
     def _settled(self, message: CollisionReport | Trajectory, alarm: Alarm | None) -> Alarm | None:
-        """Tell the extended watch whether a judged message passed, and return `alarm`."""
+        """Tell the extended watch whether the message that it judged passed, and return `alarm`."""
         if self._watch is not None:
             self._watch.accept(message) if alarm is None else self._watch.lose(type(message))
         return alarm

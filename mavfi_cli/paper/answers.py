@@ -31,7 +31,7 @@ _KINDS = {  # kinds of faults: level, and effect on the struck node
 
 
 def judgement_of(judged: JudgedClaim, stack: str, fate: Fate = Fate.ALL) -> Judgement | None:
-    """Return a claim's judgement on a stack, or in isolated kernels if the claim is about those.
+    """Return the judgement of a claim for a stack, or for isolated kernels if it is about those.
 
     Return None if the claim was not judged there for faults of this fate.
     """
@@ -224,9 +224,10 @@ class DetectorBalance:
 
     @classmethod
     def of(cls, stack: str, flights: Flights) -> Iterator[Self]:
-        """Yield a balance for each level, platform, detector and fate with pairs of flights.
+        """Yield the balance for each combination of level, platform, detector and fate of faults.
 
-        A pair consists of the flights with the same fault without and with the detector.
+        A pair is a fault that was flown without and with the detector. Combinations without pairs
+        are omitted.
         """
         watched = flights.comparable.chosen(detector=(*DETECTOR_TITLES,), bare_struck=True)
         for level, computer, detector in sorted(

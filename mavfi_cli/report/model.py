@@ -123,7 +123,7 @@ def _cells_of(row: SchemeResult | FlownScheme) -> Json:
 
 
 def _number_with_ends(name: str, number: ModelAndFlights) -> dict[str, float]:
-    """Return the model's number, the flights' number with its interval, and their difference.
+    """Return the modelled value, the flown value with its interval, and their difference.
 
     The values are keyed by column name.
 

@@ -263,7 +263,7 @@ def struck_nodes(
     *,
     profiles: Path,
 ) -> dict[int, StruckInjection]:
-    """Inject the faults of several missions in rehearsals of their nodes.
+    """Strike the nodes of several missions, each in a rehearsal: the node without its flight.
 
     Args:
         flown: the flown mission, which equals the others without their faults.
