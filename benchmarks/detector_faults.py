@@ -62,7 +62,7 @@ def main() -> None:
                 counts.update(_what_happened(calm_result, struck_result))
         total = counts["flights"]
         print(f"{name}: {total} flights with a flip in the detector, 95 % Wilson intervals")
-        for what in ("not injected", "no effect at all", "alarms", "lost", "longer by over 5 %"):
+        for what in ("not injected", "no effect at all", "alarms", "lost", "longer by over 10 %"):
             share = wilson(counts[what], total)
             figures = f"{100 * share.share:5.1f} % ({100 * share.low:.1f}, {100 * share.high:.1f})"
             print(f"  {what:<20} {share.count:4d}  {figures}")
@@ -79,7 +79,7 @@ def _what_happened(calm: dict, struck: dict) -> list[str]:
     if calm["outcome"] == "success" != struck["outcome"]:
         found.append("lost")
     elif calm["outcome"] == struck["outcome"] == "success" and times[1] > LONGER * times[0]:
-        found.append("longer by over 5 %")
+        found.append("longer by over 10 %")
     if len(found) == 1:
         found.append("no effect at all")
     return found

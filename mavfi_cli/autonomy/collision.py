@@ -230,6 +230,7 @@ def _sample_ahead(
 ) -> tuple[int, float]:
     """Sample the rest of the reference at points that are at most `spacing_m` apart.
 
+    The points of a piece longer than MAX_SAMPLES_A_PIECE times `spacing_m` are farther apart.
     The points and their times are written to `points` and `times_s`. A straight line bridges a gap
     between the end of one waypoint's motion and the next waypoint. Every loop is bounded by the
     number of waypoints, by MAX_SAMPLES_A_PIECE or by `points`.

@@ -56,7 +56,7 @@ def record_inputs(config: MissionConfig) -> tuple[KernelInputs, ...]:
         _spread(range(len(clouds))),
         _checks(name, recorder),
         _problems(config, recorder),
-        _tracked(ticks, params),
+        _tracked(name, ticks, params),
         strict=True,
     )
     return tuple(
@@ -116,9 +116,11 @@ def _problems(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]:
     tasks = _hard_tasks(config, recorder)
     for seed in range(config.seed + 1, config.seed + _FLIGHTS):
         if len(tasks) >= INPUTS_A_KERNEL:
-            return _spread(tasks)
+            break
         another = replace(config, seed=seed)
         tasks += _hard_tasks(another, _flown(another))
+    if len(tasks) >= INPUTS_A_KERNEL:
+        return _spread(tasks)
     raise TargetError(
         _flight_name(config),
         "the planner had to avoid obstacles too few times, even in flights with the next seeds; "
@@ -152,12 +154,12 @@ def _hard_tasks(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]
 
 
 def _tracked(
-    ticks: list[ControlInput], params: tracking.TrackingParams
+    name: str, ticks: list[ControlInput], params: tracking.TrackingParams
 ) -> list[tuple[tracking.TrackingState, tracking.TrackingInputs]]:
     """Return pairs of state and input of the controller, at ticks in which it had a trajectory."""
     following = [index for index, tick in enumerate(ticks) if tick.inputs.trajectory is not None]
     if not following:
-        raise TargetError("golden flight", "the vehicle never followed a trajectory")
+        raise TargetError(name, "the vehicle never followed a trajectory")
     first = ticks[0]
     state = tracking.TrackingState(yaw_rad=first.yaw_rad, stamp_s=first.inputs.stamp_s)
     chosen, tracked = _spread(following), []

@@ -64,8 +64,14 @@ class McNemar:
             first, second: success of each mission under each treatment, (n,).
             weights: (n,) weights of a stratified sample; None for equal weights.
             clusters: (n,) the cluster of each mission; None for independent missions.
+
+        Raises:
+            ValueError: both weights and clusters are given.
         """
         from scipy.stats import binomtest
+
+        if weights is not None and clusters is not None:
+            raise ValueError("weights cannot be combined with clusters")
 
         ends = 2 * np.asarray(first, dtype=np.int64) + np.asarray(second, dtype=np.int64)
         neither, only_second, only_first, both = np.bincount(ends, minlength=4).tolist()
