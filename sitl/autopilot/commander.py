@@ -110,7 +110,7 @@ class Commander:
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
         self.stamp_us = 0
-        self.user_mode = FlightMode.LOITER
+        self.user_mode = self.mode_before_offboard = FlightMode.LOITER
         self.failsafe: FlightMode | None = None  # failsafe mode that overrides the user's
         self.armed = False
         self.landed = True  # on the ground
@@ -204,6 +204,8 @@ class Commander:
                 Severity.CRITICAL, f"Switching to {mode.label} is currently not available"
             )
             return Result.TEMPORARILY_REJECTED
+        if self.user_mode is not FlightMode.OFFBOARD:
+            self.mode_before_offboard = self.user_mode
         self.user_mode = mode
         self.failsafe = None
         return Result.ACCEPTED

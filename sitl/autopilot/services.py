@@ -123,6 +123,18 @@ def _set_mode(autopilot: Autopilot, message: Any, link: Link) -> Result:
     return autopilot.enter_mode(FlightMode.from_numbers(main, sub or 0))
 
 
+def _guided_enable(autopilot: Autopilot, message: Any, _link: Link) -> Result:
+    """Enter OFFBOARD, or the mode before it.
+
+    PX4 up to v1.13 has this command (Commander.cpp), and older companions send it. Later versions
+    answer UNSUPPORTED.
+    """
+    enters = message.param1 > 0.5
+    return autopilot.enter_mode(
+        FlightMode.OFFBOARD if enters else autopilot.commander.mode_before_offboard
+    )
+
+
 def _takeoff(autopilot: Autopilot, message: Any, _link: Link) -> Result:
     height = autopilot.parameters.effective("MIS_TAKEOFF_ALT")
     target = float(autopilot.snapshot.home_ned_m[2]) - height
@@ -232,6 +244,7 @@ def _reboot(autopilot: Autopilot, message: Any, link: Link) -> Result:
 _COMMANDS: Mapping[int, _CommandHandler] = {
     dialect.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
     dialect.MAV_CMD_DO_SET_MODE: _set_mode,
+    dialect.MAV_CMD_NAV_GUIDED_ENABLE: _guided_enable,
     dialect.MAV_CMD_NAV_TAKEOFF: _takeoff,
     dialect.MAV_CMD_NAV_LAND: lambda autopilot, *_: autopilot.enter_mode(FlightMode.LAND),
     dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda autopilot, *_: autopilot.enter_mode(

@@ -118,6 +118,19 @@ def test_set_mode_message_is_answered_once(flying):
     assert flying.mode is FlightMode.LAND
 
 
+def test_guided_enable_enters_offboard_and_goes_back_as_px4_up_to_v1_13_does(
+    flying, velocity_target
+):
+    guided = dialect.MAV_CMD_NAV_GUIDED_ENABLE
+    flying.command(guided, 1)
+    assert flying.acks() == [(guided, Result.TEMPORARILY_REJECTED)]  # there are no setpoints
+    flying.run(0.5, velocity_target)
+    for value, mode in ((1, FlightMode.OFFBOARD), (1, FlightMode.OFFBOARD), (0, FlightMode.LOITER)):
+        flying.command(guided, value)
+        assert flying.acks() == [(guided, Result.ACCEPTED)]
+        assert flying.mode is mode
+
+
 @pytest.fixture
 def offboard(flying, velocity_target):
     flying.run(0.5, velocity_target)
