@@ -1,0 +1,43 @@
+r"""Counts the missions that instruction-level faults lose, apart for silent faults and dead nodes.
+
+    python benchmarks/silent_and_dead.py docs/results/replica-table4-part1.parquet \
+        --by world label_node_restart_s detector
+
+Reads exports of campaigns (`mavfi campaign export`). A mission counts if its golden flight (the
+same world, world seed, seed, stack and platform) succeeded, and if its fault was read. A fault is
+dead if its node ended, and silent otherwise. A mission is lost if it does not end in success.
+Intervals are Wilson's, 95 %.
+"""
+
+from __future__ import annotations
+
+import collections
+
+from exported import Row, arguments, flown, key, lost, share
+
+PAIRED = ("world", "world_seed", "seed", "stack", "platform")
+
+
+def main() -> None:
+    """Read the exports, and print a row for each combination of values of the columns."""
+    parser = arguments(__doc__)
+    parser.add_argument("--by", nargs="+", required=True, help="columns that name a cell")
+    given = parser.parse_args()
+    rows = flown(given.parts)
+    golden = {key(row, PAIRED): lost(row) for row in rows if row["injected"] == "golden"}
+    cells: dict[tuple[str, ...], list[Row]] = collections.defaultdict(list)
+    for row in rows:
+        counts = row["level"] == "instruction" and row["activation"] == "read"
+        if counts and golden.get(key(row, PAIRED)) is False:
+            cells[tuple(str(row.get(name) or "") for name in given.by)].append(row)
+    print(f"| {' | '.join(given.by)} | lost | lost, dead node | lost, silent |")
+    print("|---" * (len(given.by) + 3) + "|")
+    for name, cell in sorted(cells.items()):
+        dead = [row for row in cell if row["node_ended"]]
+        silent = [row for row in cell if not row["node_ended"]]
+        counts = (share(sum(map(lost, part)), len(part)) for part in (cell, dead, silent))
+        print(f"| {' | '.join(name)} | {' | '.join(counts)} |")
+
+
+if __name__ == "__main__":
+    main()
