@@ -151,5 +151,5 @@ def test_without_valgrind_a_long_program_is_refused_by_advice(place, monkeypatch
     monkeypatch.setattr(profiles, "STEPS", 1000)
     where = place("counting", "60000")
     where.limits = programs.RunLimits(profile_steps=1000)
-    with pytest.raises(TargetError, match="if valgrind is installed"):
+    with pytest.raises(TargetError, match="install valgrind"):
         where.profile(np.random.default_rng(1))

@@ -38,7 +38,7 @@ def run(capfd):
         (["--world", "farm", "--goal", "900,0,5"], "goal (900, 0, 5) is outside"),
         (["--world", "farm", "--start", "6.4,10,0"], "start (6.4, 10, 0) is blocked"),
         (["--world", "/nowhere/at/all.toml"], "/nowhere/at/all.toml"),
-        (["--world", "farm", "--link", "carrier:pigeon"], "carrier"),
+        (["--world", "farm", "--link", "carrier:pigeon"], "unknown kind"),
         (["--world", "farm", "--link", "udpin:0.0.0.0:14777"], "sign"),
         (["--world", "farm", "--camera-rate", "1000"], "camera rate"),
         (["--world", "farm", "--key-file", "/nowhere/key"], "/nowhere/key"),
@@ -48,7 +48,7 @@ def run(capfd):
 )
 def test_known_error_is_one_line(run, arguments, words):
     code, out, errors = run(*arguments)
-    usage = ("did you mean", "is outside", "is blocked")
+    usage = ("did you mean", "is outside", "is blocked", "unknown kind")
     assert (code, out) == (2 if any(each in words for each in usage) else 1, "")
     assert errors.startswith("error: ")
     assert errors.count("\n") == 1

@@ -111,7 +111,7 @@ def test_instruction_level_attacks_each_node():
 def test_seeds_that_a_model_was_made_with_are_refused(models):
     plan = replace(PLAN, models=models)
     plan.require_held_out()
-    with pytest.raises(ModelError, match=r"gad .* train-0.2-5/41: seeds 41"):
+    with pytest.raises(ModelError, match=r"gad .* train-0.2-5/41, so seeds 41"):
         replace(plan, first_seed=41).require_held_out()
     with pytest.raises(ModelError, match=r"train-0.05-3/40"):
         replace(plan, first_seed=38).require_held_out()

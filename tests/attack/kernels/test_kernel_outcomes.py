@@ -146,11 +146,11 @@ def test_two_kernels_of_one_name_are_refused(known_target):
     path = Path(known_target("return 7;").kernel)
     other = path.with_name("other.py")
     other.write_text(path.read_text())
-    with pytest.raises(TargetError, match=r"^known: several"):
+    with pytest.raises(TargetError, match=r"^known: more than one"):
         catalogue.select([str(path), str(other)])
     other.write_text(path.read_text().replace('"known"', '"control"'))
     catalogue.find.cache_clear()
-    with pytest.raises(TargetError, match=r"^control: several"):
+    with pytest.raises(TargetError, match=r"^control: more than one"):
         catalogue.select(["control", str(other)])
 
 
