@@ -13,6 +13,7 @@ from mavfi_cli.stats.shares import wilson
 
 Row = Mapping[str, Any]
 Key = tuple[Any, ...]
+PAIRED = ("world", "world_seed", "seed", "stack", "platform")  # of a mission and its golden flight
 
 
 def arguments(text: str | None) -> argparse.ArgumentParser:
@@ -36,6 +37,11 @@ def key(row: Row, names: tuple[str, ...]) -> Key:
 def lost(row: Row) -> bool:
     """Return True if the mission did not end in success."""
     return bool(row["outcome"] != "success")
+
+
+def golden_lost(rows: list[Row]) -> dict[Key, bool]:
+    """Return whether each golden flight was lost, keyed by its values of PAIRED."""
+    return {key(row, PAIRED): lost(row) for row in rows if row["injected"] == "golden"}
 
 
 def share(count: int, total: int) -> str:

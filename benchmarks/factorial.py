@@ -16,7 +16,7 @@ import collections
 import itertools
 
 import numpy as np
-from exported import Key, Row, flown, key, lost, share
+from exported import PAIRED, Key, Row, flown, golden_lost, key, lost, share
 
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import holm, sign_flips
@@ -29,7 +29,6 @@ FACTORS = {
     "dead nodes": ("back after 1 s", "never back"),
     "injector": ("any bit, by execution", "ROSFI's"),
 }
-PAIR = ("world", "world_seed", "seed", "stack")
 
 
 def levels(row: Row, *, fixed: bool) -> tuple[bool, ...]:
@@ -51,10 +50,10 @@ def outcomes(parts: list[str], *, fixed: bool) -> dict[Key, dict[tuple[bool, ...
     Missions whose golden flight is lost are left out.
     """
     rows = flown(parts)
-    golden = {key(row, PAIR): lost(row) for row in rows if row["injected"] == "golden"}
+    golden = golden_lost(rows)
     cells: dict[Key, dict[tuple[bool, ...], list[bool]]] = collections.defaultdict(dict)
     for row in rows:
-        if row["injected"] != "golden" and golden.get(key(row, PAIR)) is False:
+        if row["injected"] != "golden" and golden.get(key(row, PAIRED)) is False:
             cell = cells[key(row, ("world", "seed"))]
             cell.setdefault(levels(row, fixed=fixed), []).append(lost(row))
     return cells

@@ -14,11 +14,9 @@ from __future__ import annotations
 import collections
 from collections.abc import Iterable
 
-from exported import Row, arguments, flown, key, lost, share
+from exported import PAIRED, Row, arguments, flown, key, lost, share
 
 from mavfi_cli.analysis.pairs import LONGER
-
-PAIRED = ("world", "world_seed", "seed", "stack", "platform")
 
 
 def lines(rows: list[Row], by: Iterable[str]) -> list[str]:

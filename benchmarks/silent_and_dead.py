@@ -13,9 +13,7 @@ from __future__ import annotations
 
 import collections
 
-from exported import Row, arguments, flown, key, lost, share
-
-PAIRED = ("world", "world_seed", "seed", "stack", "platform")
+from exported import PAIRED, Row, arguments, flown, golden_lost, key, lost, share
 
 
 def main() -> None:
@@ -24,7 +22,7 @@ def main() -> None:
     parser.add_argument("--by", nargs="+", required=True, help="columns that name a cell")
     given = parser.parse_args()
     rows = flown(given.parts)
-    golden = {key(row, PAIRED): lost(row) for row in rows if row["injected"] == "golden"}
+    golden = golden_lost(rows)
     cells: dict[tuple[str, ...], list[Row]] = collections.defaultdict(list)
     for row in rows:
         counts = row["level"] == "instruction" and row["activation"] == "read"

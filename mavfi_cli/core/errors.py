@@ -19,6 +19,11 @@ class MavfiError(Exception):
 
     exit_code = 1
 
+    def as_usage(self) -> Self:
+        """Return this error with the exit code of a usage error, 2."""
+        self.exit_code = 2
+        return self
+
 
 def described(error: BaseException) -> str:
     """Return the type and the message of an error as `TYPE: MESSAGE`.

@@ -115,30 +115,28 @@ class Endpoint:
         return connection
 
 
-class _UrlError(LinkError):
-    """The URL is not valid, which is a usage error."""
-
-    exit_code = 2
-
-
 def parse_endpoint(url: str) -> Endpoint:
     """Parse a URL of the form `scheme:rest` or `scheme://rest`.
 
     Raises LinkError if the scheme is unknown (the message lists the known ones), or the rest is
     malformed or out of range.
     """
+
+    def invalid(problem: str) -> LinkError:
+        return LinkError(f"{url}: {problem}").as_usage()
+
     word, _, rest = url.partition(":")
     rest = rest.removeprefix("//")
     scheme = _ALIASES.get(word, word)
     if scheme not in _FORMS:
-        raise _UrlError(f"{url}: unknown kind of endpoint; known: {', '.join(_FORMS.values())}")
-    malformed = _UrlError(f"{url}: not of the form {_FORMS[scheme]}")
+        raise invalid(f"unknown kind of endpoint; known: {', '.join(_FORMS.values())}")
+    malformed = invalid(f"not of the form {_FORMS[scheme]}")
 
     def number(text: str, largest: int) -> int:
         if not re.fullmatch(r"[0-9]{1,10}", text, re.ASCII):
             raise malformed
         if int(text) > largest:
-            raise _UrlError(f"{url}: the number must be at most {largest}, got {text}")
+            raise invalid(f"the number must be at most {largest}, got {text}")
         return int(text)
 
     if scheme == "fd":
@@ -156,7 +154,7 @@ def parse_endpoint(url: str) -> Endpoint:
         raise malformed
     port = number(match["port"], 65_535)
     if port == 0 and scheme not in LISTENING:
-        raise _UrlError(f"{url}: the port must be at least 1, got 0")
+        raise invalid("the port must be at least 1, got 0")
     return Endpoint(url=url, scheme=scheme, host=host or _LOOPBACK, port=port)
 
 

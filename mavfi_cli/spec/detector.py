@@ -24,12 +24,6 @@ COMPANION = "companion:"
 """Prefix of the stack name in a model that was fitted to a user's companion."""
 
 
-class _NoModel(ModelError):
-    """The option that names the model is missing, which is a usage error."""
-
-    exit_code = 2
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorConfig:
     """The detector of a mission: its model, its threshold and the states that it watches.
@@ -171,7 +165,8 @@ class DetectorConfig:
             return detector
         fit = "fit one with mavfi train --companion"
         if path is None:
-            raise _NoModel(f"{self.name} needs --model, a model fitted to the companion; {fit}")
+            problem = f"{self.name} needs --model, a model fitted to the companion; {fit}"
+            raise ModelError(problem).as_usage()
         if not made_for.name.startswith(COMPANION):
             raise ModelError(
                 f"this model was fitted to the stack {made_for.name!r}, not to a companion; {fit}",

@@ -233,12 +233,6 @@ def _place(what: str, place: Sequence[float] | Vector | None) -> Vector | None:
 # Generated worlds ---------------------------------------------------------------------------------
 
 
-class _GeneratorError(WorldError):
-    """Error for invalid parameters of the world generator, which count as a usage error."""
-
-    exit_code = 2
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Pair:
     """The two parameters of the world generator, and the family of its random streams."""
@@ -249,10 +243,11 @@ class _Pair:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.density <= 1.0:
-            raise _GeneratorError(f"density must be between 0 and 1, got {self.density:g}")
+            problem = f"density must be between 0 and 1, got {self.density:g}"
+            raise WorldError(problem).as_usage()
         if not 0.0 < self.size_m <= _CELL_M:
             limits = f"above 0 and at most {_CELL_M:g} m"
-            raise _GeneratorError(f"size must be {limits}, got {self.size_m:g}")
+            raise WorldError(f"size must be {limits}, got {self.size_m:g}").as_usage()
 
 
 # Pairs of the paper (section VI-A): two for evaluation, four for training.
@@ -273,9 +268,8 @@ def _pair_of_spec(text: str) -> _Pair | None:
     try:
         density, size = (float(part) for part in text.removeprefix("gen:").split(","))
     except ValueError:
-        raise _GeneratorError(
-            f"world must be gen:density,size, such as gen:0.2,5, got {text!r}"
-        ) from None
+        problem = f"world must be gen:density,size, such as gen:0.2,5, got {text!r}"
+        raise WorldError(problem).as_usage() from None
     return _Pair(density=density, size_m=size)
 
 

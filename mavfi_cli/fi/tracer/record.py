@@ -195,6 +195,24 @@ class _Repeatable:
             raise RecordError(f"the fault record is damaged: {error}") from None
         return read
 
+    def fault(self) -> InstructionFault:
+        """Return the fault. Raises RecordError if an entry is out of its range."""
+        try:
+            code = bytes.fromhex(self.instruction_bytes)
+            if self.corruption is not None and self.corruption.site is Site.MEMORY:
+                instruction = decode(code, 0)
+                if instruction is None or self.corruption.memory_operand >= len(instruction.memory):
+                    raise ValueError("its instruction has no such memory operand")
+            return InstructionFault(
+                trigger=tuple(stage.stop() for stage in self.trigger),
+                execution=self.k,
+                instruction=self.instruction,
+                instruction_bytes=code,
+                corruption=self.corruption,
+            )
+        except ValueError as error:
+            raise RecordError(f"the fault record is damaged: {error}") from None
+
 
 def _require_range(name: str, value: int, low: int, high: int) -> None:
     if not low <= value <= high:
@@ -220,22 +238,7 @@ def fault_of(record: FaultRecord) -> InstructionFault:
     Raises:
         RecordError: the record is damaged or has another version.
     """
-    read = _Repeatable.of(record)
-    try:
-        code = bytes.fromhex(read.instruction_bytes)
-        if read.corruption is not None and read.corruption.site is Site.MEMORY:
-            instruction = decode(code, 0)
-            if instruction is None or read.corruption.memory_operand >= len(instruction.memory):
-                raise ValueError("its instruction has no such memory operand")
-        return InstructionFault(
-            trigger=tuple(stage.stop() for stage in read.trigger),
-            execution=read.k,
-            instruction=read.instruction,
-            instruction_bytes=code,
-            corruption=read.corruption,
-        )
-    except ValueError as error:
-        raise RecordError(f"the fault record is damaged: {error}") from None
+    return _Repeatable.of(record).fault()
 
 
 def require_same_build(record: FaultRecord, image: Image) -> None:
@@ -246,10 +249,10 @@ def require_same_build(record: FaultRecord, image: Image) -> None:
             trigger; the message names all such objects.
         RecordError: the record is damaged or has another version.
     """
-    stops = [stop.location for stop in fault_of(record).trigger]
-    build_ids, differences = _Repeatable.of(record).build_ids, []
-    for name in {location.object: None for location in stops} | build_ids:
-        loaded, build_id = image.find(name), build_ids.get(name)
+    read, differences = _Repeatable.of(record), []
+    stops = [stop.location for stop in read.fault().trigger]
+    for name in {location.object: None for location in stops} | read.build_ids:
+        loaded, build_id = image.find(name), read.build_ids.get(name)
         if loaded is None:
             differences.append(f"{name} is not loaded")
         elif loaded.build_id != build_id:

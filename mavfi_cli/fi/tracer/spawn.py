@@ -38,12 +38,6 @@ _KEPT = frozenset(("HOME", "LANG", "LANGUAGE", "LD_LIBRARY_PATH", "PATH", "TZ"))
 _KEPT_BEGINNINGS = ("LC_", "OMP_", "OPENBLAS_", "MKL_")
 
 
-class _NoProgram(TargetError):
-    """A program that does not exist, which is a usage error."""
-
-    exit_code = 2
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Program:
     """A program to start with fixed addresses, a fixed environment and output in files."""
@@ -77,7 +71,8 @@ class Program:
         """
         program = shutil.which(argv[0])
         if program is None:
-            raise _NoProgram(argv[0], "the program was not found or is not executable")
+            problem = "the program was not found or is not executable"
+            raise TargetError(argv[0], problem).as_usage()
         chosen = _kept_environment() if environment is None else environment
         return cls(
             argv=(str(Path(program).resolve()), *argv[1:]),

@@ -77,7 +77,7 @@ def _ends_at(tid: int, ip: int, stop: NDArray[np.int64]) -> bool:
 
 
 @compiled
-def _step(tid: int, group: int, request: int, report: NDArray[np.int32]) -> bool:
+def _resume(tid: int, group: int, request: int, report: NDArray[np.int32]) -> bool:
     """Resume the thread and wait. Return True if a breakpoint or a finished step stopped it."""
     _ptrace(request, tid, 0, 0)
     report[0] = _wait4(group, report.ctypes.data + report.itemsize, _OF_OWN_THREAD, 0)
@@ -115,7 +115,7 @@ def _run(
             recorded += 1
             if _is_repeated(word):
                 repeating = ip
-        if not _step(tid, group, _SINGLESTEP, report):
+        if not _resume(tid, group, _SINGLESTEP, report):
             return recorded, OTHER_STATUS
 
 
@@ -178,7 +178,7 @@ def _row_at(ip: int, spans: NDArray[np.int64], rows: NDArray[np.int32]) -> int:
 
 
 @compiled
-def _go_on(tid: int, block: NDArray[np.int64], covered: NDArray[np.bool_]) -> int:
+def _leave_block(tid: int, block: NDArray[np.int64], covered: NDArray[np.bool_]) -> int:
     """Make the jump that ends a block, or go to its end and restore the code there.
 
     Returns the address at which execution continues.
@@ -235,20 +235,20 @@ def _run_blocks(
                 _poke_byte(tid, end, _INT3)
                 covered[place] = True
             own = members[block[_FIRST] : block[_FIRST] + count]
-            trapped = _step(tid, group, _CONT, report)
+            trapped = _resume(tid, group, _CONT, report)
             executed = _executed(_ptrace(_PEEKUSER, tid, _IP, 0), own)
             trace[recorded : recorded + executed] = own[:executed]
             recorded += executed
             if not trapped or executed < count:
                 return recorded, OTHER_STATUS
-        ip = _go_on(tid, block, covered)
+        ip = _leave_block(tid, block, covered)
         if how == _CARE:
             return recorded, NEEDS_CARE
         if how != _ANOTHER:
             trace[recorded] = end
             recorded += 1
         if how == _STEPPED:
-            if not _step(tid, group, _SINGLESTEP, report):
+            if not _resume(tid, group, _SINGLESTEP, report):
                 return recorded, OTHER_STATUS
             ip = _ptrace(_PEEKUSER, tid, _IP, 0)
 
@@ -276,25 +276,25 @@ class Blocks:
             if 0 <= start - first < len(code):
                 break
             before += len(code)
-        end, members, way = start, list[int](), _Way(0, _ANOTHER)
+        end, members, after = start, list[int](), _Next(0, _ANOTHER)
         while end == start or (end not in self._ends and len(members) < _LONGEST):
-            way = _way_through(code[end - first : end - first + 16], end)
-            if way.how != _ANOTHER or end + way.size - first >= len(code):
+            after = _next_of(code[end - first : end - first + 16], end)
+            if after.how != _ANOTHER or end + after.size - first >= len(code):
                 break
             members.append(end)
-            end += way.size
+            end += after.size
         else:
-            way = _Way(0, _ANOTHER)
-        if way.size and way.how == _ANOTHER:  # the last instruction of the span
-            way = replace(way, how=_STEPPED)
+            after = _Next(0, _ANOTHER)
+        if after.size and after.how == _ANOTHER:  # the last instruction of the span
+            after = replace(after, how=_STEPPED)
         if self._count == len(self._blocks):
             self._blocks = np.concatenate([self._blocks, np.zeros_like(self._blocks)])
         if self._used + len(members) > len(self._members):
             self._members = np.concatenate([self._members, np.zeros_like(self._members)])
         self._rows[before + start - first] = self._count
         self._blocks[self._count] = (
-            end, before + end - first, code[end - first], way.how, way.target, way.condition,
-            end + way.size, self._used, len(members),
+            end, before + end - first, code[end - first], after.how, after.target, after.condition,
+            end + after.size, self._used, len(members),
         )  # fmt: skip
         self._members[self._used : self._used + len(members)] = members
         self._used, self._count = self._used + len(members), self._count + 1
@@ -319,7 +319,7 @@ class Blocks:
 
 
 @dataclass(frozen=True, slots=True)
-class _Way:
+class _Next:
     """How execution goes on after one instruction; see the columns of a block."""
 
     size: int
@@ -329,25 +329,25 @@ class _Way:
 
 
 @functools.lru_cache(maxsize=65536)
-def _way_through(code: bytes, address: int) -> _Way:
+def _next_of(code: bytes, address: int) -> _Next:
     """Decode how execution goes on after the instruction whose code is at the start of `code`."""
     decoded = next(engine.disasm(code, address, 1), None)
     if decoded is None:
-        return _Way(1, _STEPPED)
+        return _Next(1, _STEPPED)
     size = decoded.size
     if BRANCHES.isdisjoint(decoded.groups) and decoded.mnemonic not in FIXED:
-        return _Way(size, _ANOTHER)
+        return _Next(size, _ANOTHER)
     if code[:2] == b"\x0f\x05":
-        return _Way(size, _CARE)
+        return _Next(size, _CARE)
     near = int.from_bytes(code[1:size], "little", signed=True)
     if (code[0], size) in ((0xEB, 2), (0xE9, 5)):
-        return _Way(size, _JUMP, address + size + near)
+        return _Next(size, _JUMP, address + size + near)
     if code[0] >> 4 == 7 and size == 2:
-        return _Way(size, _CONDITIONAL, address + size + near, code[0] & 15)
+        return _Next(size, _CONDITIONAL, address + size + near, code[0] & 15)
     if code[0] == 0x0F and code[1] >> 4 == 8 and size == 6:
         near = int.from_bytes(code[2:6], "little", signed=True)
-        return _Way(size, _CONDITIONAL, address + size + near, code[1] & 15)
-    return _Way(size, _STEPPED)
+        return _Next(size, _CONDITIONAL, address + size + near, code[1] & 15)
+    return _Next(size, _STEPPED)
 
 
 def load() -> None:

@@ -1,5 +1,7 @@
 """The profile is the truth about what executed, and every trigger drawn from it is exact."""
 
+import os
+import signal
 from collections import Counter
 
 import numpy as np
@@ -16,7 +18,7 @@ from mavfi_cli.fi.tracer.sampling import (
     draw_fault,
     record_window,
 )
-from mavfi_cli.fi.tracer.tracee import ExecutionCounter, Mechanism
+from mavfi_cli.fi.tracer.tracee import Ended, ExecutionCounter, Mechanism
 
 
 def profile_of(start, name, *arguments, limit=100_000, reads_own_code=True):
@@ -100,6 +102,22 @@ def test_a_function_called_from_foreign_code_ends_there_too(start, mechanism, re
     assert window[0] == compare
     assert image.locate(tracee.registers.ip).object.startswith("libc")
     assert tracee.run_to(compare, 1)
+
+
+@pytest.mark.parametrize("reads_own_code", [True, False])
+def test_a_program_that_is_killed_in_its_window_ends_the_window(start, reads_own_code):
+    tracee = start("counting", "1000")
+
+    def kill(recorded):
+        if recorded:
+            os.kill(tracee.pid, signal.SIGKILL)
+
+    window = record_window(
+        tracee, Image(tracee.pid).scope(["counting"]), limit=100_000, program="", watch=kill,
+        reads_own_code=reads_own_code,
+    )  # fmt: skip
+    assert 0 < len(window) < 10_000
+    assert tracee.ended == Ended(exit_code=None, signal=signal.SIGKILL)
 
 
 def test_a_window_that_is_too_long_is_refused(start):
