@@ -25,7 +25,6 @@ from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.paper.items import ITEMS, KERNELS_FOLDER, FlightsPlan, Source
 from mavfi_cli.report.attacks import save_runs, summarise
 
-_MEASURED = 12  # missions to measure for a forecast if too few have finished
 _OF_A_KIND = 4  # a kind with this many finished missions needs no measurement
 _NEWEST = 2000  # maximum number of finished missions in a forecast: the last ones
 _ROW_BYTES, _FOLDER_BYTES = 20_000, 2_000_000  # per mission in the ledger; per kept run
@@ -178,34 +177,24 @@ def _missing(ledger: Ledger, wanted: frozenset[int]) -> dict[int, str]:
 def _measured(
     ledger: Ledger, wanted: frozenset[int], options: Options, spectator: Spectator
 ) -> list[int]:
-    """Fly a few missions of each kind that has few results, so that their times can be forecast.
+    """Fly the first missing repetition if a kind has few results, so that times can be forecast.
 
-    Some missions are flown first and not measured, because they also fly golden flights that later
-    missions share.
+    A repetition contains missions of every setting, and shares flights as all repetitions do. The
+    mean time of a kind is therefore that of the missing missions.
 
     Returns:
         Numbers of the finished missions on which the forecast should be based.
     """
     missing = _missing(ledger, wanted)
     over = sorted(wanted.difference(missing))[-_NEWEST:]
-    if len(missing) <= _MEASURED:
-        return over
     known = Counter(kind for kind, _ in _kinds(ledger.results(over)))
-    kinds: dict[str, list[int]] = {}
-    for number, kind in sorted(missing.items()):
-        kinds.setdefault(kind, []).append(number)
-    rare = [numbers for kind, numbers in kinds.items() if known[kind] < _OF_A_KIND]
-    first, measured = list[int](), list[int]()
-    for place, numbers in enumerate(sorted(rare, key=len)):
-        last = min(len(numbers), len(ledger.cells())) - 1  # last place in the first repetition
-        count = -(-(_MEASURED - len(measured)) // (len(rare) - place))
-        places = range(0, last, max(2, last // count))[:count]
-        first += [numbers[place] for place in places]
-        measured += [numbers[place + 1] for place in places]
-    if measured:
-        spectator.on_note(f"measuring {len(measured)} missions")
-    for part in (first, measured):
-        fly_missing(ledger, replace(options, only=frozenset(part)), Spectator())
+    seeds = {mission.number: mission.config.seed for mission in ledger.missing()}
+    first = min((seeds[number] for number in missing), default=0)
+    measured = [number for number in sorted(missing) if seeds[number] == first]
+    if len(measured) == len(missing) or all(known[kind] >= _OF_A_KIND for kind in missing.values()):
+        return over
+    spectator.on_note(f"measuring the first repetition, {len(measured)} missions")
+    fly_missing(ledger, replace(options, only=frozenset(measured)), spectator)
     return over + measured
 
 
