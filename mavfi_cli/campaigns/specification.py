@@ -18,7 +18,7 @@ from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
-SAMPLE = 20  # `sampled` keeps about one success in 20
+SAMPLE = 20  # `sampled` keeps about one success in 20, and `few` about one failure
 _WORD = 1 << 32
 Factors = Mapping[str, Any]  # values of factors by name, as in TOML
 
@@ -91,6 +91,7 @@ class Keep(Enum):
     """Policy that selects the run folders to keep. Every outcome except success is a failure."""
 
     NONE = "none"
+    FEW = "few"  # one failure in SAMPLE
     FAILURES = "failures"
     SAMPLED = "sampled"  # all failures, and one success in SAMPLE
     ALL = "all"
@@ -99,12 +100,12 @@ class Keep(Enum):
         """Return True if the run folder of mission `number`, with this outcome, is to be kept."""
         if self is Keep.ALL or self is Keep.NONE:
             return self is Keep.ALL
-        mixed = number  # hashed, so that sampled successes cover all settings in whatever order
+        mixed = number  # hashed, so that sampled flights cover all settings in whatever order
         for factor in (0x9E3779B1, 0x85EBCA6B):  # odd, so that no two numbers collide
             mixed = mixed * factor % _WORD
             mixed ^= mixed >> 15
-        sampled = self is Keep.SAMPLED and mixed < _WORD // SAMPLE
-        return outcome != "success" or sampled
+        sampled, failed = mixed < _WORD // SAMPLE, outcome != "success"
+        return (failed and (sampled or self is not Keep.FEW)) or (sampled and self is Keep.SAMPLED)
 
 
 Flown = tuple[tuple[int, ...], ...]  # for each candidate, the replans of its golden runs

@@ -35,7 +35,7 @@ _SAMPLING = _what("--sampling", type=click.Choice(["uniform", "stratified"]),
 _WORLDS = _what("--worlds", type=click.Choice(["fixed", "many"]),
                 help="Worlds of a campaign that has fixed ones: these, or another one for each "
                      "seed  [fixed].")  # fmt: skip
-_KEEP = ("none", "failures", "sampled", "all")
+_KEEP = ("none", "few", "failures", "sampled", "all")
 # Options of `status` that imply --full.
 _FULL = {"by", "confidence", "quality", "overhead", "failures"}
 _OPEN_CLUSTER = (

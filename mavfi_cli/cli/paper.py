@@ -47,6 +47,7 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
     interruption.
     """
     from mavfi_cli.campaigns.run import Options
+    from mavfi_cli.campaigns.specification import Keep
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.core.files import plain
     from mavfi_cli.paper.flying import opened
@@ -66,7 +67,7 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
     else:
         refuse_given(("hours",), "needs --settle")
     with missions_view(quiet=quiet) as view:
-        flying = Options(**given_fields(Options))
+        flying = Options(keep=Keep.FEW, **given_fields(Options))
         run(plan, flying, view, lambda forecast: view.on_note(forecast.summary))
         settled = None
         if options["settle"]:

@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 
+import numpy as np
+
 from mavfi_cli.analysis.kernels import KERNELS, KernelSummary
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.kernels.catalogue import select
@@ -20,15 +22,19 @@ from mavfi_cli.campaigns.ledger import LEDGER, RUNS, Ledger
 from mavfi_cli.campaigns.missions import MissionResult
 from mavfi_cli.campaigns.progress import Progress, Spectator, duration
 from mavfi_cli.campaigns.run import PROFILES, Options, fly_missing, require_unchanged, store_plan
+from mavfi_cli.campaigns.specification import SAMPLE, Keep
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.paper.items import ITEMS, KERNELS_FOLDER, FlightsPlan, Source
 from mavfi_cli.report.attacks import save_runs, summarise
 
+_FEW = 12  # so few missing missions are not measured
+_MEASURED = 100  # missions to measure for a forecast if too few have finished
 _OF_A_KIND = 4  # a kind with this many finished missions needs no measurement
 _NEWEST = 2000  # maximum number of finished missions in a forecast: the last ones
 _ROW_BYTES, _FOLDER_BYTES = 20_000, 2_000_000  # per mission in the ledger; per kept run
 _PROFILES_BYTES = 10_000_000  # profiles of one golden flight
+_OVERLAP = 2  # repetitions whose profiles are on the disk at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,10 +183,9 @@ def _missing(ledger: Ledger, wanted: frozenset[int]) -> dict[int, str]:
 def _measured(
     ledger: Ledger, wanted: frozenset[int], options: Options, spectator: Spectator
 ) -> list[int]:
-    """Fly the first missing repetition if a kind has few results, so that times can be forecast.
+    """Fly some missions if a kind has few results, so that times can be forecast.
 
-    A repetition contains missions of every setting, and shares flights as all repetitions do. The
-    mean time of a kind is therefore that of the missing missions.
+    Whole shared flights are drawn, because a mission that is forked from one takes much less time.
 
     Returns:
         Numbers of the finished missions on which the forecast should be based.
@@ -188,12 +193,19 @@ def _measured(
     missing = _missing(ledger, wanted)
     over = sorted(wanted.difference(missing))[-_NEWEST:]
     known = Counter(kind for kind, _ in _kinds(ledger.results(over)))
-    seeds = {mission.number: mission.config.seed for mission in ledger.missing()}
-    first = min((seeds[number] for number in missing), default=0)
-    measured = [number for number in sorted(missing) if seeds[number] == first]
-    if len(measured) == len(missing) or all(known[kind] >= _OF_A_KIND for kind in missing.values()):
+    left = Counter(missing.values())
+    if len(missing) <= _FEW or all(known[kind] >= min(_OF_A_KIND, left[kind]) for kind in left):
         return over
-    spectator.on_note(f"measuring the first repetition, {len(measured)} missions")
+    groups: dict[object, list[int]] = {}
+    for mission in ledger.missing():
+        if (number := mission.number) in missing:
+            groups.setdefault(mission.config.shared_flight or number, []).append(number)
+    flights, measured = list(groups.values()), list[int]()
+    for place in np.random.default_rng(_SEED).permutation(len(flights)):
+        measured += flights[place]
+        if len(measured) >= min(_MEASURED, len(missing) / 4):
+            break
+    spectator.on_note(f"measuring {len(measured)} missions")
     fly_missing(ledger, replace(options, only=frozenset(measured)), spectator)
     return over + measured
 
@@ -239,13 +251,15 @@ def _with_flights(
     rows = sum(path.stat().st_size for path in ledger.folder.glob(f"{LEDGER}*"))
     row_bytes = rows / ledger.over() if flown else _ROW_BYTES
     run_bytes = _mean_size(ledger.folder / RUNS, _FOLDER_BYTES)
-    kept = len(missing.keys() & options.kept) + losses * len(missing)
+    failures = losses * len(missing) / (SAMPLE if options.keep is Keep.FEW else 1)
+    kept = len(missing.keys() & options.kept) + failures
     profiled = {
         mission.config.golden
         for mission in ledger.missing()
         if mission.number in missing and mission.config.instruction is not None
     }
-    profiles = len(profiled) * _mean_size(ledger.folder / PROFILES, _PROFILES_BYTES)
+    most = max(Counter(golden.seed for golden in profiled).values(), default=0)
+    profiles = _OVERLAP * most * _mean_size(ledger.folder / PROFILES, _PROFILES_BYTES)
     return replace(
         forecast,
         missions=len(wanted),

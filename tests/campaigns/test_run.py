@@ -209,6 +209,7 @@ def test_a_full_disk_stops_the_campaign_and_costs_nothing(campaign):
     ("keep", "kept"),
     [
         (Keep.NONE, []),
+        (Keep.FEW, []),
         (Keep.FAILURES, ["000001-end-1"]),
         (Keep.SAMPLED, ["000000-fly-0", "000001-end-1"]),
         (Keep.ALL, ["000000-fly-0", "000001-end-1", "000002-fly-2"]),
@@ -225,9 +226,10 @@ def test_run_folders_are_kept_by_policy(campaign, keep, kept):
 
 
 @pytest.mark.parametrize("settings", [1, 7, 20, 40, 136, 137])
-def test_the_sample_of_successes_has_some_of_every_setting(settings):
+@pytest.mark.parametrize(("keep", "outcome"), [(Keep.SAMPLED, "success"), (Keep.FEW, "timeout")])
+def test_the_sample_has_some_of_every_setting(settings, keep, outcome):
     repetitions = 200  # the settings take turns in the list
-    kept = [Keep.SAMPLED.wants(n, "success") for n in range(settings * repetitions)]
+    kept = [keep.wants(n, outcome) for n in range(settings * repetitions)]
     for setting in range(settings):
         assert 1 <= sum(kept[setting::settings]) <= 25
     assert sum(kept) / len(kept) == pytest.approx(1 / 20, rel=0.1 if settings > 1 else 0.5)

@@ -218,7 +218,7 @@ def test_instruction_level_and_lists_of_values():
         ("[factors]\nbits = [1, 1]", ConfigError, r"factors.bits: .*twice"),
         ("repetitions = 0", ConfigError, r"repetitions: .*at least 1, got 0"),
         ("repetitions = true", ConfigError, r"repetitions: .*got True"),
-        ("keep = 'some'", UnknownName, r"Known: all, failures, none, sampled"),
+        ("keep = 'some'", UnknownName, r"Known: all, failures, few, none"),
         ("setting = 3", ConfigError, r"setting: must be one or more"),
         ("setting = []", ConfigError, r"has no missions"),
         ("repetitions = 1_000_001", ConfigError, r"at most 1000000 missions, got 1000001"),
