@@ -212,7 +212,7 @@ class Referee:
 
     def log(self) -> dict[str, Vector]:
         """Return the columns of the log, keyed by name, with one row per observation."""
-        columns = zip(*self._rows, strict=True)
+        columns = zip(*self._rows, strict=True) if self._rows else [[] for _ in _COLUMNS]
         return {name: np.array(column) for name, column in zip(_COLUMNS, columns, strict=True)}
 
     def save(self, folder: Path, energies_j: Mapping[str, float] | None = None) -> None:

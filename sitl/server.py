@@ -215,17 +215,14 @@ def _await_answer(
 ) -> bool:
     """Handle the companion's messages until it answers the tick at `stamp_ms`.
 
-    Return False if stopped first. Raises VehicleProcessError if the companion sends nothing for
-    `limit_s`.
+    Return False if stopped first. Raises VehicleProcessError if the companion does not answer
+    within `limit_s`.
     """
-    received_s = time.monotonic()
+    asked_s = time.monotonic()
     while not stopped():
-        messages = client.receive(_LOOK_UP_S)
-        if _answers(messages, stamp_ms):
+        if _answers(client.receive(_LOOK_UP_S), stamp_ms):
             return True
-        if messages:
-            received_s = time.monotonic()
-        elif time.monotonic() > received_s + limit_s:
+        if time.monotonic() > asked_s + limit_s:
             raise VehicleProcessError(
                 f"the companion did not answer the tick at {stamp_ms} ms within {limit_s:g} s"
             )

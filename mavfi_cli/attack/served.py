@@ -88,6 +88,7 @@ class ServedProcess:
                 sys.executable, line, {**environment, **_FIXED},
                 file_actions=actions, setsid=True,
             )  # fmt: skip
+        self._ended = False
 
     def begin(self, message: Any, name: str) -> Any:
         """Send the first message, wait until the program is ready, and return its answer.
@@ -116,6 +117,9 @@ class ServedProcess:
         return lines[-1] if lines else "its process ended"
 
     def _end(self) -> None:
+        if self._ended:  # its id may be that of another process by now
+            return
+        self._ended = True
         self.connection.close()
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGKILL)

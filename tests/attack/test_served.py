@@ -34,6 +34,15 @@ def test_a_program_that_was_started_early_is_taken_once(started):
     assert len({each.pid for each in started}) == 2
 
 
+def test_a_program_is_killed_once(started, monkeypatch):
+    program = served.ServedProcess.of(MODULE)
+    program.kill()
+    killed = []
+    monkeypatch.setattr(served.os, "kill", lambda *asked: killed.append(asked))
+    program.kill()
+    assert killed == []
+
+
 def environment(pid):
     while not (found := Path(f"/proc/{pid}/environ").read_bytes()):
         os.sched_yield()  # empty until the program has its own memory

@@ -1,7 +1,9 @@
 """Lockstep over a real socket pair with a real child process."""
 
+import contextlib
 import json
 import re
+import time
 
 import numpy as np
 import pytest
@@ -125,6 +127,17 @@ def test_silent_companion_is_an_error_in_one_line(companion):
     vehicle.receive_tick()
     _, errors = vehicle.process.communicate(timeout=30)
     assert vehicle.process.returncode == 1
+    assert re.fullmatch("error: .* 0 ms within 0.3 s\n", errors)
+
+
+def test_a_companion_that_talks_but_never_answers_is_an_error(companion):
+    vehicle = companion("--answer-limit", "0.3")
+    vehicle.receive_tick()
+    with contextlib.suppress(OSError):  # the vehicle ends
+        while vehicle.process.poll() is None:
+            vehicle.answer(time_boot_ms=999)
+            time.sleep(0.05)
+    _, errors = vehicle.process.communicate(timeout=30)
     assert re.fullmatch("error: .* 0 ms within 0.3 s\n", errors)
 
 

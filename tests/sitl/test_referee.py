@@ -55,6 +55,10 @@ def test_a_collision_has_its_own_moment_and_place() -> None:
     assert watcher.min_clearance_m == 0.0
 
 
+def test_a_log_without_observations_has_empty_columns() -> None:
+    assert {len(column) for column in referee().log().values()} == {0}
+
+
 def test_hitting_the_ground_is_a_collision() -> None:
     watcher = referee()
     see(watcher, 0.0, 0.0)
