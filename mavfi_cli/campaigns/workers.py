@@ -229,6 +229,8 @@ def _end_of_flight(message: Mapping[str, Any]) -> str:
     if "timeout" in message:
         return "their flight did not end in time"
     text = report.get("text") or report.get("traceback", "").rstrip().rpartition("\n")[2]
+    if text == SystemExit.__name__:  # the usual end of a shared flight
+        return "their faults could not be injected in a rehearsal"
     return f"their flight failed: {text}" if text else "their flight ended early"
 
 

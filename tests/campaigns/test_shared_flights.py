@@ -11,6 +11,7 @@ import pytest
 from killing import processes
 from live_processes import none_left
 
+from mavfi_cli.campaigns import workers
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import MissingMission, PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
@@ -231,6 +232,12 @@ def test_a_mission_that_cannot_be_forked_is_flown_alone_and_says_so(
     forked = ["forked_s" in result["host"] for result in results]
     assert said == [None, None, reason] or said == [None, reason, None]
     assert forked == [text is None for text in said]
+
+
+def test_a_flight_that_ended_without_forking_a_mission_has_a_reason():
+    usual = {"report": {"traceback": "Traceback\n  ...\nSystemExit\n"}}
+    assert "rehearsal" in workers._end_of_flight(usual)
+    assert "ValueError: 3" in workers._end_of_flight({"report": {"traceback": "ValueError: 3\n"}})
 
 
 @pytest.mark.slow
