@@ -74,17 +74,17 @@ def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> P
     def fork(number: int) -> bool:
         return forks.fork(number, branches[number][1], task["limit_s"])
 
-    strike = None
+    strike, reasons = None, list[str]()
     if any(config.instruction is not None for config, _ in branches.values()):
         from mavfi_cli.mission.instruction.injection import keep_orders, struck_nodes
 
         if config.detector is not None:  # a detector may change the requests to nodes
             keep_orders(config.golden, profiles, fly_golden)
-        strike = partial(struck_nodes, profiles=profiles)
+        strike = partial(struck_nodes, profiles=profiles, omit=reasons.append)
     flown = config.shared_flight
     assert flown is not None
     first = SharedFlight(branches, fork, strike)
     for shared in itertools.chain([first], first.further()):
         with contextlib.suppress(SystemExit):
             return fly_mission(flown, out, Watcher(), shared=shared).path
-    raise SystemExit
+    raise SystemExit("; ".join(dict.fromkeys(reasons)))  # why missions were not forked

@@ -101,9 +101,14 @@ def test_a_forked_mission_is_that_flown_alone(missions, flown_alone, tmp_path):
     assert forked == len(missions) - 1  # one is left for a job
 
 
-STRUCK = {  # node and seed, of each stack, by the effect on the node
-    "hardened": {"masked": ("octomap", 1), "changed": ("planner", 3), "ended": ("control", 3)},
-    "mavbench": {"changed": ("control", 1)},
+STRUCK = {  # the faults of each stack, by the effect on the node
+    "hardened": {
+        "masked": {"target": "octomap", "seed": 1},
+        "changed": {"target": "planner", "seed": 3},
+        "ended": {"target": "control", "seed": 3},
+        "hung": {"target": "planner", "seed": 23, "invocation_seed": 3},
+    },
+    "mavbench": {"changed": {"target": "control", "seed": 1}},
 }
 
 
@@ -116,14 +121,14 @@ def test_a_node_struck_in_a_rehearsal_flies_as_if_struck_in_flight(short_config,
     null = InstructionConfig(target="point_cloud", null=True)
     cases = [(base, faults)]
     if stack == "hardened":
-        cases += [(guarded, faults[1:2]), (quick, faults[-1:])]
+        cases += [(guarded, faults[1:2]), (quick, faults[2:])]
     configs = [
         *(unharmed for unharmed, _ in cases),
         *(replace(unharmed, instruction=null) for unharmed, _ in cases[1:2]),
         *(
-            replace(unharmed, instruction=InstructionConfig(target=node, seed=seed))
+            replace(unharmed, instruction=InstructionConfig(**fault))
             for unharmed, faults in cases
-            for node, seed in faults
+            for fault in faults
         ),
     ]
     flown = {}
@@ -205,26 +210,57 @@ class _Notes(Spectator):
         self.most_flights = max(self.most_flights, progress.running)
 
 
-def flown_both_ways(configs, tmp_path, **options):
+def flown_both_ways(configs, tmp_path, *, stop=None, **options):
     """Notes about the missions of one flight, and their results; they equal those flown alone."""
     listed, watcher = [PlannedMission(config=config) for config in configs], _Notes()
-    with run_campaign(listed, tmp_path / "shared", Options(jobs=1, **options), watcher) as ledger:
+    shared, whole = Options(jobs=1, **options), Options(jobs=1, whole=True)
+    with run_campaign(listed, tmp_path / "shared", shared, watcher, stop=stop) as ledger:
         rows, results = rows_of(ledger), [row.result for row in ledger.results()]
-    with run_campaign(listed, tmp_path / "whole", Options(jobs=1, whole=True)) as ledger:
+    with run_campaign(listed, tmp_path / "whole", whole, stop=stop) as ledger:
         assert rows == rows_of(ledger)
     assert watcher.most_flights == 1
     return watcher.notes, results
 
 
+@pytest.fixture
+def task(monkeypatch):
+    """Make a module of this folder the task whose missions share flights; return its name."""
+
+    def use(name):
+        paths = [os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")]
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
+        monkeypatch.setattr("mavfi_cli.campaigns.run.TASK", name)
+        return name
+
+    return use
+
+
 @pytest.mark.slow
-def test_a_mission_that_cannot_be_forked_is_flown_alone_and_says_so(
-    short_config, tmp_path, monkeypatch
+@traced
+def test_a_node_whose_memory_cannot_be_compared_is_struck_in_flight_and_says_so(
+    short_config, tmp_path, task
 ):
-    paths = [os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
-    monkeypatch.setattr("mavfi_cli.campaigns.run.TASK", "unforkable_task")
+    fault = InstructionConfig(**STRUCK["hardened"]["masked"])
+    configs = [short_config, replace(short_config, instruction=fault)]
+    notes, results = flown_both_ways(configs, tmp_path, task=task("incomparable_task"))
+    assert [note.endswith("its memory cannot be read") for note in notes] == [True]
+    assert results[1]["host"]["alone"].endswith("its memory cannot be read")
+
+
+@pytest.mark.slow
+def test_a_stop_rule_ends_a_setting_after_the_same_missions(short_config, tmp_path):
+    fault = FaultConfig(target="waypoint_position", together=True, field="exponent")
+    base = replace(short_config, time_limit_s=20.0)
+    configs = [replace(base, fault=replace(fault, seed=seed)) for seed in range(12)]
+    stop = Stop(margin=0.3, batch=4)
+    _, results = flown_both_ways(configs, tmp_path, stop=stop)
+    assert 4 <= len(results) < 12
+
+
+@pytest.mark.slow
+def test_a_mission_that_cannot_be_forked_is_flown_alone_and_says_so(short_config, tmp_path, task):
     configs = [replace(short_config, fault=fault) for fault in (None, *FAULTS[:2])]
-    notes, results = flown_both_ways(configs, tmp_path, task="unforkable_task")
+    notes, results = flown_both_ways(configs, tmp_path, task=task("unforkable_task"))
     reason = "cannot fork: Resource temporarily unavailable"
     (note,) = notes
     assert note.endswith(f" alone: 1; {reason}")
@@ -235,8 +271,8 @@ def test_a_mission_that_cannot_be_forked_is_flown_alone_and_says_so(
 
 
 def test_a_flight_that_ended_without_forking_a_mission_has_a_reason():
-    usual = {"report": {"traceback": "Traceback\n  ...\nSystemExit\n"}}
-    assert "rehearsal" in workers._end_of_flight(usual)
+    usual = {"report": {"traceback": "Traceback\n  ...\nSystemExit: node planner: why\n"}}
+    assert workers._end_of_flight(usual).endswith("rehearsal: node planner: why")
     assert "ValueError: 3" in workers._end_of_flight({"report": {"traceback": "ValueError: 3\n"}})
 
 

@@ -262,6 +262,7 @@ def struck_nodes(
     recorder: Recorder,
     *,
     profiles: Path,
+    omit: Callable[[str], None] = lambda _reason: None,
 ) -> dict[int, StruckInjection]:
     """Strike the nodes of several missions, each in a rehearsal: the node without its flight.
 
@@ -271,6 +272,7 @@ def struck_nodes(
         recorder: recorder of the flight of `flown`. If `flown` differs from its golden mission, the
             requests of the golden mission must already be stored.
         profiles: folder that keeps golden flights and profiles.
+        omit: called with the reason for each omitted fault, or once for all faults of a node.
 
     Returns:
         The injections by mission number. Faults that cannot be planned, or whose effect cannot be
@@ -288,19 +290,23 @@ def struck_nodes(
         for number in sorted(drawn, key=lambda number: drawn[number][0].order):
             invocation, rng = drawn[number]
             if flown != golden and not node.received_alike(seen, invocation):
+                omit(f"the detector changed what node {node.name} received before the fault")
                 continue
-            with contextlib.suppress(MavfiError, OSError):
+            try:
                 fault, context = node.fault(requests[number], invocation, rng)
                 struck = node.rehearsal.strike(fault, invocation, context)
+            except (MavfiError, OSError) as error:
+                omit(str(error))
+            else:
                 injections[number] = StruckInjection(struck, node.name, invocation.order)
 
     def work(_armed: Callable[[], None]) -> None:
         for name, numbers in by_node.items():
-            with (
-                contextlib.suppress(MavfiError, OSError),
-                contextlib.closing(_GoldenNode(golden, name, profiles, orders)) as node,
-            ):
-                strike(node, numbers)
+            try:
+                with contextlib.closing(_GoldenNode(golden, name, profiles, orders)) as node:
+                    strike(node, numbers)
+            except (MavfiError, OSError) as error:
+                omit(str(error))
 
     TracerThread(work).result()
     return injections
