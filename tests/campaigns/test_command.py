@@ -65,6 +65,20 @@ def test_a_campaign_is_flown_and_summed_up(flown):
     assert len(list((folder / "runs").glob("*/result.json"))) == 4
 
 
+@pytest.mark.slow
+def test_whole_flies_every_mission_from_its_start(flown, mavfi, tmp_path):
+    folder, _ = flown
+    run = mavfi("campaign", "run", written(tmp_path), "--whole", "--quiet", cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    shared, whole = (
+        [json.loads(file.read_text()) for file in sorted(place.glob("runs/*/result.json"))]
+        for place in (folder, tmp_path / "campaigns" / "short")
+    )
+    hosts = [[result.pop("host") for result in results] for results in (shared, whole)]
+    assert [any("forked_s" in host for host in own) for own in hosts] == [True, False]
+    assert whole == shared
+
+
 def test_a_complete_campaign_flies_nothing_again(flown, mavfi):
     folder, _ = flown
     for what in ([folder], [folder, "--missing-only"]):

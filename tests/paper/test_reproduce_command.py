@@ -48,6 +48,19 @@ def test_a_reproduction_ends_with_a_line_an_item(folder, mavfi):
     assert f"mavfi report {folder.parent} -o report.html" in run.stdout
 
 
+def test_claims_that_are_not_settled_in_time_have_bounds(folder, mavfi, tmp_path):
+    shutil.copytree(folder.parent, tmp_path / "copy")
+    line = ("--scale", "0.02", "--settle", "--hours", "1e-6", "--out", tmp_path / "copy")
+    run = mavfi("reproduce", "fig9", *line)
+    assert run.returncode == 0, run.stderr
+    assert "1 claims are undecided:" in run.stderr
+    end = run.stdout.partition("\nClaims at all looks together\n")[2]
+    assert end.startswith("fig9-fields: cannot tell; ")
+    page = tmp_path / "page.html"
+    assert mavfi("report", tmp_path / "copy", "-o", page).returncode == 0
+    assert "At all looks together, cannot tell" in page.read_text()
+
+
 def test_one_item_is_shown_whole(tmp_path, mavfi):
     run = mavfi("reproduce", "fig15", "--out", tmp_path / "new")
     assert run.returncode == 0
