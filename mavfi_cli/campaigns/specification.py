@@ -104,8 +104,10 @@ class Keep(Enum):
         for factor in (0x9E3779B1, 0x85EBCA6B):  # odd, so that no two numbers collide
             mixed = mixed * factor % _WORD
             mixed ^= mixed >> 15
-        sampled, failed = mixed < _WORD // SAMPLE, outcome != "success"
-        return (failed and (sampled or self is not Keep.FEW)) or (sampled and self is Keep.SAMPLED)
+        sampled = mixed < _WORD // SAMPLE
+        if outcome == "success":
+            return sampled and self is Keep.SAMPLED
+        return sampled or self is not Keep.FEW
 
 
 Flown = tuple[tuple[int, ...], ...]  # for each candidate, the replans of its golden runs

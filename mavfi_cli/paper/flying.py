@@ -28,7 +28,7 @@ from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.paper.items import ITEMS, KERNELS_FOLDER, FlightsPlan, Source
 from mavfi_cli.report.attacks import save_runs, summarise
 
-_FEW = 12  # so few missing missions are not measured
+_UNMEASURED = 12  # largest number of missing missions that are not measured
 _MEASURED = 100  # missions to measure for a forecast if too few have finished
 _OF_A_KIND = 4  # a kind with this many finished missions needs no measurement
 _NEWEST = 2000  # maximum number of finished missions in a forecast: the last ones
@@ -194,7 +194,9 @@ def _measured(
     over = sorted(wanted.difference(missing))[-_NEWEST:]
     known = Counter(kind for kind, _ in _kinds(ledger.results(over)))
     left = Counter(missing.values())
-    if len(missing) <= _FEW or all(known[kind] >= min(_OF_A_KIND, left[kind]) for kind in left):
+    if len(missing) <= _UNMEASURED or all(
+        known[kind] >= min(_OF_A_KIND, left[kind]) for kind in left
+    ):
         return over
     groups: dict[object, list[int]] = {}
     for mission in ledger.missing():
