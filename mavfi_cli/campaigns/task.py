@@ -83,7 +83,7 @@ def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> P
         strike = partial(struck_nodes, profiles=profiles, omit=reasons.append)
     flown = config.shared_flight
     assert flown is not None
-    first = SharedFlight(branches, fork, strike)
+    first = SharedFlight(branches, fork, strike, reasons.append)
     for shared in itertools.chain([first], first.further()):
         with contextlib.suppress(SystemExit):
             return fly_mission(flown, out, Watcher(), shared=shared).path

@@ -230,8 +230,7 @@ def _end_of_flight(message: Mapping[str, Any]) -> str:
         return "their flight did not end in time"
     text = report.get("text") or report.get("traceback", "").rstrip().rpartition("\n")[2]
     if text.startswith(SystemExit.__name__):  # the usual end of a shared flight
-        reason = text.partition(": ")[2] or "unknown"
-        return f"their faults could not be injected in a rehearsal: {reason}"
+        return text.partition(": ")[2] or "their flight ended early"
     return f"their flight failed: {text}" if text else "their flight ended early"
 
 

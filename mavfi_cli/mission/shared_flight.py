@@ -87,6 +87,7 @@ class SharedFlight(NoInjection):
             returns False after the fork's end.
         strike: strikes nodes in rehearsals, for missions with instruction-level faults; receives
             the flown mission, the faults by number, and the recorder of the flight.
+        omit: called with the reason for each fault that cannot be drawn.
 
     Attributes:
         flight: the flight; set before its first message.
@@ -104,9 +105,10 @@ class SharedFlight(NoInjection):
         branches: Mapping[int, Branch],
         fork: Callable[[int], bool],
         strike: StrikeNodes | None = None,
+        omit: Callable[[str], None] = lambda _reason: None,
     ) -> None:
         super().__init__()
-        self._fork, self._strike_nodes = fork, strike
+        self._fork, self._strike_nodes, self._omit = fork, strike, omit
         self._requests = {
             number: config.instruction
             for number, (config, _) in branches.items()
@@ -142,8 +144,9 @@ class SharedFlight(NoInjection):
         for number, injection in list(self._injections.items()):
             try:
                 injection.aim(shortest_flight_s, protection)
-            except MavfiError:  # flown alone, the mission reports it
+            except MavfiError as error:  # flown alone, the mission reports it
                 del self._injections[number]
+                self._omit(str(error))
             injection.injector.follower = self.injector.follower  # which the companion updates
 
     def news(self) -> list[str]:

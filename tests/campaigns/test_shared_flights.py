@@ -248,6 +248,16 @@ def test_a_node_whose_memory_cannot_be_compared_is_struck_in_flight_and_says_so(
 
 
 @pytest.mark.slow
+def test_a_fault_that_cannot_be_drawn_says_why(short_config, tmp_path):
+    guarded = replace(short_config, detector=GAD)
+    lost = replace(guarded, fault=FaultConfig(target="detector.nothing", at="tick=5"))
+    notes, results = flown_both_ways([guarded, lost], tmp_path)
+    (note,) = notes
+    assert " alone: 1; unknown array in the detector's memory 'nothing'; known: " in note
+    assert results[1] == {}
+
+
+@pytest.mark.slow
 def test_a_stop_rule_ends_a_setting_after_the_same_missions(short_config, tmp_path):
     fault = FaultConfig(target="waypoint_position", together=True, field="exponent")
     base = replace(short_config, time_limit_s=20.0)
@@ -272,7 +282,7 @@ def test_a_mission_that_cannot_be_forked_is_flown_alone_and_says_so(short_config
 
 def test_a_flight_that_ended_without_forking_a_mission_has_a_reason():
     usual = {"report": {"traceback": "Traceback\n  ...\nSystemExit: node planner: why\n"}}
-    assert workers._end_of_flight(usual).endswith("rehearsal: node planner: why")
+    assert workers._end_of_flight(usual) == "node planner: why"
     assert "ValueError: 3" in workers._end_of_flight({"report": {"traceback": "ValueError: 3\n"}})
 
 
