@@ -252,8 +252,7 @@ def test_a_fault_that_cannot_be_drawn_says_why(short_config, tmp_path):
     guarded = replace(short_config, detector=GAD)
     lost = replace(guarded, fault=FaultConfig(target="detector.nothing", at="tick=5"))
     notes, results = flown_both_ways([guarded, lost], tmp_path)
-    (note,) = notes
-    assert " alone: 1; unknown array in the detector's memory 'nothing'; known: " in note
+    assert " alone: 1; unknown array in the detector's memory 'nothing'; known: " in notes[0]
     assert results[1] == {}
 
 
