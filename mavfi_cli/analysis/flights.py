@@ -223,12 +223,16 @@ def exported(ledger: Ledger) -> pa.Table:
 def read_export(path: Path) -> pa.Table:
     """Read the table of a campaign from its exported .parquet file.
 
-    Columns written by earlier versions are converted to the current types.
+    Columns written by earlier versions are converted to the current types. The paths of run folders
+    are null: the file may come from anybody, and may name any folder of this computer.
 
     Raises:
         RecordError: the file is missing or damaged.
     """
-    return _updated(stored_export(path), path)
+    table = _updated(stored_export(path), path)
+    if (place := table.schema.get_field_index("path")) >= 0:
+        table = table.set_column(place, "path", pa.nulls(table.num_rows, pa.string()))
+    return table
 
 
 def _updated(table: pa.Table, path: Path) -> pa.Table:

@@ -262,6 +262,22 @@ class Flights:
         )
 
     @property
+    def by_worlds(self) -> dict[str, Flights]:
+        """The flights in `fixed` worlds, and those in `many` worlds, another one for each seed.
+
+        A kind without flights is omitted. Flights outside the paper's environments, such as those
+        that train detectors, belong to both kinds.
+        """
+        fixed = pc.is_valid(self.table["world_seed"])
+        ours = pc.is_in(self.table["world"], pa.array(WORLDS))
+        kinds = {"fixed": fixed, "many": pc.invert(fixed)}
+        return {
+            name: Flights(self.table.filter(pc.or_(kind, pc.invert(ours))))
+            for name, kind in kinds.items()
+            if pc.any(pc.and_(kind, ours)).as_py()
+        }
+
+    @property
     def seeds(self) -> list[tuple[str, int]]:
         """The world and the seed of each flight. Flights that share both are not independent."""
         return list(zip(self["world"], self["seed"], strict=True))

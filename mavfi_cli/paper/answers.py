@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, product
 from pathlib import Path
 from typing import Self
 
@@ -15,7 +15,7 @@ from mavfi_cli.analysis.flights import COSTS
 from mavfi_cli.analysis.pairs import Balance, Fate, Flights
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.paper.items import BY_NAME, STACKS, printed_name
+from mavfi_cli.paper.items import BY_NAME, STACKS, printed_name, stack_of
 from mavfi_cli.paper.verdicts import ISOLATED, LEVEL, JudgedClaim, Judgement, Verdict
 from mavfi_cli.report.paper import DETECTOR_TITLES
 from mavfi_cli.stats.shares import Share, wilson
@@ -184,7 +184,7 @@ def reason_of(judged: JudgedClaim, stack: str) -> str:
     judgement = judgement_of(judged, stack)
     if not judgement or judgement.verdict is not Verdict.CONTRADICTED or judgement.effect is None:
         return ""
-    explained = judged.claim.isolated or stack == STACKS[0]
+    explained = judged.claim.isolated or stack_of(stack) == STACKS[0]
     return words if explained and low <= judgement.effect.value <= high else ""
 
 
@@ -309,11 +309,16 @@ class Safeguard:
 
 
 def protections(flights: Mapping[str, Flights]) -> list[Safeguard]:
-    """Judge each detector on the first stack, and each other stack as a substitute for the first.
+    """Judge each detector at the first place, and each other stack as a substitute for the first.
 
     Detectors and stacks are omitted if nothing was flown to judge them.
+
+    Args:
+        flights: flights by place, from `Evidence.by_place`.
     """
-    (name, first), *others = flights.items()
+    name, first = next(iter(flights.items()))
+    own = [place for place in flights if stack_of(place) == stack_of(name)]
+    others = [place for place in flights if place not in own]
     safeguards = [
         Safeguard(
             name=f"{title} detector",
@@ -327,10 +332,11 @@ def protections(flights: Mapping[str, Flights]) -> list[Safeguard]:
         )
         for detector, title in DETECTOR_TITLES.items()
     ]
-    for other, second in others:
-        shares = [_harmed(*both) for both in ((first, second), (second, first))]
+    for one, other in product(own, others):
+        both = flights[one], flights[other]
+        shares = [_harmed(*both), _harmed(*reversed(both))]
         against = {kind: _Against.of_shares(*(mine[kind] for mine in shares)) for kind in _KINDS}
-        safeguards.append(Safeguard(name=f"{other} instead of {name}", against=against, costs={}))
+        safeguards.append(Safeguard(name=f"{other} instead of {one}", against=against, costs={}))
     return [protection for protection in safeguards if any(protection.against.values())]
 
 
@@ -346,13 +352,17 @@ def _harmed(flights: Flights, others: Flights) -> dict[str, Share]:
 
     Only scenes that `others` contains too are counted. A scene is a world with a mission seed.
     """
-    scenes = {*zip(others["world"], others["seed"], strict=True)}
+    scenes = {*_scenes(others)}
     mine = flights.struck(platform=_COMPUTER)
-    mine = mine.where(scene in scenes for scene in mine.seeds)
+    mine = mine.where(scene in scenes for scene in _scenes(mine))
     return {
         kind: mine.of_fate(fate).chosen(level=level).share("harmed")
         for kind, (level, fate) in _KINDS.items()
     }
+
+
+def _scenes(flights: Flights) -> Iterator[tuple[object, ...]]:
+    return zip(flights["world"], flights["world_seed"], flights["seed"], strict=True)
 
 
 # Added time ---------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from mavfi_cli.analysis.pairs import Fate, Flights
 from mavfi_cli.campaigns.missions import canonical
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import BY_NAME, DType
-from mavfi_cli.paper.items import printed
+from mavfi_cli.paper.items import place_of, printed
 from mavfi_cli.report.paper import Printed
 from mavfi_cli.spec.mission import LIMITS
 from mavfi_cli.stats.paired import McNemar, holm
@@ -320,6 +320,7 @@ class RestartComparison:
     """Success of a stack in a world on the same faults, with different restart delays.
 
     Attributes:
+        place: the stack, with the kind of its worlds if the missions have both kinds.
         paper: success rates in Table IV, in per cent, for golden flights and for flights with a
             fault; None if the table lacks the world.
         golden: share of golden flights that succeed.
@@ -328,7 +329,7 @@ class RestartComparison:
         p_value: p-value of McNemar's exact test between the earliest and the latest restart.
     """
 
-    stack: str
+    place: str
     world: str
     paper: Sequence[Printed]
     golden: Share
@@ -343,15 +344,27 @@ class RestartComparison:
 
 
 def restarts(flights: Flights) -> list[RestartComparison]:
-    """Compare restart rules on the same instruction-level faults, for each stack and world."""
+    """Compare restart rules on the same instruction-level faults, for each stack and world.
+
+    Fixed worlds are compared apart from other worlds.
+    """
+    kinds = flights.by_worlds
+    if len(kinds) < 2:
+        return [*_of_kind(flights)]
+    return [
+        replace(row, place=place_of(row.place, kind))
+        for kind, mine in kinds.items()
+        for row in _of_kind(mine)
+    ]
+
+
+def _of_kind(flights: Flights) -> Iterator[RestartComparison]:
     hit = flights.struck(level="instruction").shared("stack", "world", arm="restart_s")
     by_place = {place: mine.by("restart_s") for place, mine in hit.by("stack", "world").items()}
-    return [
-        _restarts(stack, world, by_place[stack, world], flights.golden)
-        for stack in sorted({stack for stack, _ in by_place})
-        for world in hit.worlds
-        if len(by_place.get((stack, world), ())) > 1
-    ]
+    for stack in sorted({stack for stack, _ in by_place}):
+        for world in hit.worlds:
+            if len(by_place.get((stack, world), ())) > 1:
+                yield _restarts(stack, world, by_place[stack, world], flights.golden)
 
 
 def _restarts(
@@ -361,7 +374,7 @@ def _restarts(
     lost = [dict(zip(mine.faults, mine["lost"], strict=True)) for mine in flown.values()]
     first, last = ([not those[fault] for fault in sorted(lost[0])] for those in (lost[0], lost[-1]))
     return RestartComparison(
-        stack=stack,
+        place=stack,
         world=world,
         paper=[printed("table4", "success_percent", kind, world) for kind in ("golden", "none")],
         golden=golden.chosen(stack=stack, world=world).share(value=False),

@@ -49,9 +49,12 @@ from mavfi_cli.paper.items import (
     ITEMS,
     LEFT_OUT,
     STACKS,
+    WORLDS,
     Item,
     Source,
+    place_of,
     printed_name,
+    stack_of,
 )
 from mavfi_cli.paper.layouts import of_flights, of_kind
 from mavfi_cli.paper.sources import CampaignSource, Evidence
@@ -107,11 +110,15 @@ class _ItemPart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _ShownItem:
-    """An item of the paper on the page: its parts, and the names of the sources without a part."""
+    """An item of the paper on the page.
+
+    Attributes:
+        missing: for each place without a part, the command that makes the part.
+    """
 
     item: Item
     parts: Sequence[_ItemPart]
-    missing: Sequence[str]
+    missing: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,10 +152,15 @@ class _CampaignMissions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Document:
-    """The content of the results page, which shows `stack` first and collapses other stacks."""
+    """The content of the results page.
+
+    Attributes:
+        places: stacks, or a stack in each kind of worlds if the missions have both kinds. The page
+            shows the first one, and collapses the others.
+    """
 
     version: str
-    stacks: Sequence[str]
+    places: Sequence[str]
     answer: str
     crashes: str
     extent: str
@@ -180,18 +192,24 @@ class Document:
     missions: Sequence[_CampaignMissions]
 
     @property
+    def place(self) -> str:
+        """The place whose verdicts are shown first: the paper's stack, or the first one flown."""
+        return self.places[0]
+
+    @property
     def stack(self) -> str:
-        """The stack whose verdicts are shown first: the first of STACKS with flights."""
-        return self.stacks[0]
+        """The stack of `place`."""
+        return stack_of(self.place)
 
     def reason(self, judged: JudgedClaim) -> str:
-        """Return the known reason why a claim is contradicted on `stack`, or an empty string."""
-        return reason_of(judged, self.stack)
+        """Return the known reason why a claim is contradicted at `place`, or an empty string."""
+        return reason_of(judged, self.place)
 
     def verdicts(self) -> dict[str, dict[str, int]]:
-        """Return the number of claims per verdict, keyed by stack or ISOLATED, then by verdict."""
+        """Return the number of claims per verdict, keyed by place or ISOLATED, then by verdict."""
         by_place = {
-            place: [claim.verdict(place) for claim in self.claims] for place in (*STACKS, ISOLATED)
+            place: [claim.verdict(place) for claim in self.claims]
+            for place in (*self.places, ISOLATED)
         }
         return {
             place: {verdict.value: verdicts.count(verdict) for verdict in Verdict}
@@ -206,52 +224,52 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         upsets_per_hour: bit flips that reach the injection sites per flight hour.
         step: called with the name of each step when it begins.
     """
-    flown = {stack: evidence.flights(stack) for stack in STACKS}
-    stacks = sorted(STACKS, key=lambda stack: not len(flown[stack]))
-    as_paper = {stack: flown[stack].chosen(as_paper=True) for stack in stacks}
-    flights = {stack: those.chosen(at=(None, "random")) for stack, those in as_paper.items()}
+    flown = evidence.by_place(STACKS)
+    places = sorted(flown, key=lambda place: not len(flown[place]))
+    as_paper = {place: flown[place].chosen(as_paper=True) for place in places}
+    flights = {place: those.chosen(at=(None, "random")) for place, those in as_paper.items()}
     kernels = evidence.isolated
     sdc = {name: kernel.outcomes["sdc"] for name, kernel in kernels.items()}
     silent = {name: (share.count, share.total) for name, share in sdc.items()}
     step("judging the claims")
     claims = judged(flights, kernels, evidence.settled)
     step("counting what protects")
-    maps = {stack: state_map(as_paper[stack]) for stack in stacks}
-    flows = {stack: kernel_flows(flights[stack], silent) for stack in stacks}
+    maps = {place: state_map(as_paper[place]) for place in places}
+    flows = {place: kernel_flows(flights[place], silent) for place in places}
     by_arm = {
         source.name: campaign_arms
         for source in evidence.campaigns
         if (campaign_arms := arms(source.flights.comparable))
     }
-    added = [*Delays.of(stacks[0], flights[stacks[0]])]
+    added = [*Delays.of(places[0], flights[places[0]])]
     guards = protections(flights)
     step("drawing the figures")
     return Document(
         version=__version__,
-        stacks=stacks,
-        answer=answer(claims, stacks[0]),
-        crashes=crash_sentence(claims, stacks[0], flights[stacks[0]]),
+        places=places,
+        answer=answer(claims, places[0]),
+        crashes=crash_sentence(claims, places[0], flights[places[0]]),
         extent=_extent(flights, kernels, claims),
         problems=evidence.problems,
         claims=claims,
         families=Family.of(claims),
-        populations={stack: those.population for stack, those in flights.items() if len(those)},
-        forest=_forest(claims, stacks),
-        disagreements=disagreements(claims, stacks[0]),
+        populations={place: those.population for place, those in flights.items() if len(those)},
+        forest=_forest(claims, places),
+        disagreements=disagreements(claims, places[0]),
         protections=guards,
         advice=_advice(guards),
-        balances=[row for stack in stacks for row in DetectorBalance.of(stack, flights[stack])],
+        balances=[row for place in places for row in DetectorBalance.of(place, flights[place])],
         delays=_delay_picture(added),
         delay_sentence=delay_sentence(added),
-        spreads=[part for stack in stacks if (part := _spread(stack, flights[stack]))],
-        items=[*_items(evidence, {stack: flown[stack] for stack in stacks})],
+        spreads=[part for place in places if (part := _spread(place, flights[place]))],
+        items=[*_items(evidence, {place: flown[place] for place in places})],
         left_out={printed_name(name): why for name, why in LEFT_OUT.items()},
         flows=flows,
-        flow_pictures=[_flow_picture(stack, mine) for stack, mine in flows.items() if mine],
-        maps=[part for stack in stacks for part in _matrices(stack, maps[stack])],
+        flow_pictures=[_flow_picture(place, mine) for place, mine in flows.items() if mine],
+        maps=[part for place in places for part in _matrices(place, maps[place])],
         map_csv=Table.of_records(_map_rows(maps)).csv(),
         upsets_per_hour=upsets_per_hour,
-        hourly={s: [*hourly_failures(flights[s], upsets_per_hour)] for s in stacks},
+        hourly={own: [*hourly_failures(flights[own], upsets_per_hour)] for own in places},
         arms=by_arm,
         arm_pictures={name: _arm_picture(name, mine) for name, mine in by_arm.items()},
         restarts=restarts(evidence.flights().comparable),
@@ -484,12 +502,12 @@ def _items(evidence: Evidence, flights: Mapping[str, Flights]) -> Iterator[_Show
     """Yield every item of the paper, in the paper's order.
 
     Args:
-        flights: flights by stack, from `Evidence.flights`.
+        flights: flights by place, from `Evidence.by_place`.
     """
     for item in ITEMS:
         if item.source is Source.FLIGHTS:
             parts = {
-                stack: _flown(item, stack, those, evidence) for stack, those in flights.items()
+                place: _flown(item, place, those, evidence) for place, those in flights.items()
             }
         elif item.source is Source.MODEL:
             parts = {"performance model": _drawn(item, "performance model", of_model())}
@@ -500,8 +518,17 @@ def _items(evidence: Evidence, flights: Mapping[str, Flights]) -> Iterator[_Show
         yield _ShownItem(
             item=item,
             parts=[part for part in parts.values() if part],
-            missing=[place for place, part in parts.items() if part is None],
+            missing={p: _command(item, p) for p, part in parts.items() if part is None},
         )
+
+
+def _command(item: Item, place: str) -> str:
+    """Return the command that makes an item's part for a place."""
+    if place == ISOLATED:
+        return "mavfi kernels --runs 5000 --out kernels"
+    stack = stack_of(place)
+    many = " --worlds many" if place == place_of(stack, "many") else ""
+    return f"mavfi reproduce {item.name} --stack {stack}{many}"
 
 
 def _drawn(item: Item, place: str, table: PaperTable) -> _ItemPart:
@@ -509,33 +536,37 @@ def _drawn(item: Item, place: str, table: PaperTable) -> _ItemPart:
     return _ItemPart(place=place, table=table, picture=picture)
 
 
-def _flown(item: Item, stack: str, flights: Flights, evidence: Evidence) -> _ItemPart | None:
-    mine = of_kind(item, stack, flights)
+def _flown(item: Item, place: str, flights: Flights, evidence: Evidence) -> _ItemPart | None:
+    mine = of_kind(item, stack_of(place), flights)
     if not len(mine):
         return None
     table = of_flights(item.name, mine)
-    drawn = _with_runs(item, stack, evidence) if item.name in _NEED_RUNS else mine
+    drawn = _with_runs(item, place, evidence) if item.name in _NEED_RUNS else mine
     picture = None
     if drawn is not None:
         rows = [*_over_own(mine)]
         csv = Table.of_records(rows).csv() if rows else table.csv()
-        picture = _item_picture(item, stack, draw(table, drawn, "one"), csv)
+        picture = _item_picture(item, place, draw(table, drawn, "one"), csv)
     known = tuple(row for row in table.rows if any(math.isfinite(cell.value) for cell in row.cells))
-    return _ItemPart(place=stack, table=replace(table, rows=known), picture=picture)
+    return _ItemPart(place=place, table=replace(table, rows=known), picture=picture)
 
 
 def _item_picture(item: Item, place: str, figure: Figure, csv: str) -> Picture:
-    name = f"{item.name}-{place}".replace(" ", "-")
+    name = f"{item.name}-{place}".replace(",", "").replace(" ", "-")
     return Picture.of(name, f"{item.paper}: {item.title}, {place}", figure, csv)
 
 
-def _with_runs(item: Item, stack: str, evidence: Evidence) -> Flights | None:
+def _with_runs(item: Item, place: str, evidence: Evidence) -> Flights | None:
     """Return an item's flights from the first campaign that kept all their run folders.
 
     Return None if no campaign kept them all.
     """
-    folders = [source for source in evidence.campaigns if source.may_have_runs]
+    stack = stack_of(place)
+    folders = (source for source in evidence.campaigns if source.may_have_runs)
     several = (Flights.pooled([source.flights], stack) for source in folders)
+    if place != stack:
+        kind = next(kind for kind in WORLDS if place == place_of(stack, kind))
+        several = (flights.by_worlds.get(kind, Flights.pooled([])) for flights in several)
     own = (of_kind(item, stack, flights) for flights in several)
     return next((mine for mine in own if len(mine) and all(map(_is_kept, mine["path"]))), None)
 

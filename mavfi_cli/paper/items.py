@@ -26,6 +26,7 @@ from mavfi_cli.report.paper import PaperColumn, PaperRow, PaperTable, Printed
 _PAPER, _ = read_toml(Path(__file__).parent / "paper.toml")
 _META = "reproduction"  # key of the ledger's `meta`
 STACKS = ("mavbench", "hardened")  # the paper's stack, and ours
+WORLDS = {"fixed": "fixed worlds", "many": "another world for each seed"}  # kinds, as --worlds
 OUT, KERNELS_FOLDER = Path("reproduction"), "kernels"
 Key = str  # the configuration of a mission as text; equal missions have equal keys
 _ROMAN = ("", "I", "II", "III", "IV", "V", "VI", "VII")
@@ -90,6 +91,16 @@ def printed_name(name: str) -> str:
     """Return the paper's name for a figure, table or section, such as `Fig. 6` for `fig6`."""
     kind, number = name.rstrip("0123456789"), int(name.lstrip("abcdefghijklmnopqrstuvwxyz"))
     return f"Fig. {number}" if kind == "fig" else f"{kind.capitalize()} {_ROMAN[number]}"
+
+
+def place_of(stack: str, worlds: str) -> str:
+    """Return the name of a stack in one kind of worlds, such as `mavbench, fixed worlds`."""
+    return f"{stack}, {WORLDS[worlds]}"
+
+
+def stack_of(place: str) -> str:
+    """Return the stack of a place, which is a stack or a name from `place_of`."""
+    return place.removesuffix(f", {WORLDS['fixed']}").removesuffix(f", {WORLDS['many']}")
 
 
 def printed(item: str, *keys: object) -> Printed:

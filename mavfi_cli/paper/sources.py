@@ -21,7 +21,7 @@ from mavfi_cli.campaigns.specification_file import PRESETS, load_spec
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.files import file_digest, reading
 from mavfi_cli.core.installed import installed_versions, version_differences
-from mavfi_cli.paper.items import FlightsPlan
+from mavfi_cli.paper.items import FlightsPlan, place_of
 from mavfi_cli.paper.verdicts import Settling
 
 _EXPORT, _SPEC = ".parquet", ".toml"
@@ -132,13 +132,33 @@ class Evidence:
 
     @property
     def settled(self) -> Mapping[str, Settling]:
-        """The missions flown to settle claims, by stack, from the last campaign that has any."""
+        """The missions flown to settle claims, by place, from the last campaign that has any.
+
+        A place has the names that `by_place` gives it, and the stack alone.
+        """
         return {
-            stack: source.settling
+            place: source.settling
             for source in self.campaigns
             if source.settling is not None
             for stack in source.stacks
+            for place in (stack, *(place_of(stack, kind) for kind in source.flights.by_worlds))
         }
+
+    def by_place(self, stacks: Sequence[str]) -> dict[str, Flights]:
+        """Return the flights of each stack, apart for each kind of worlds if it has both kinds.
+
+        The keys are stacks, or names from `place_of`. The intervals of a table with both kinds
+        would hold for neither.
+        """
+        places = dict[str, Flights]()
+        for stack in stacks:
+            flights = self.flights(stack)
+            kinds = flights.by_worlds
+            if len(kinds) > 1:
+                places |= {place_of(stack, kind): mine for kind, mine in kinds.items()}
+            else:
+                places[stack] = flights
+        return places
 
     def flights(self, stack: str | None = None) -> Flights:
         """Return the flights of a stack, or of all stacks if None, without duplicate missions."""

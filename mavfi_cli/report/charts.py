@@ -78,8 +78,8 @@ class ForestRow:
     Attributes:
         low, high: ends of the claimed range; infinite where it is open.
         number: whether the effect is a plain number; otherwise it is a share.
-        effects: one effect per stack; None if the stack was not flown or gives no effect.
-        verdict: verdict on the claim for the first stack.
+        effects: one effect per place; None if the place was not flown or gives no effect.
+        verdict: verdict on the claim at the first place.
     """
 
     label: str
@@ -91,13 +91,15 @@ class ForestRow:
 
 
 _FOREST_IN = {"one": 2.9, "two": 4.3}
+_MARKS = (("o", 3.2, -0.2), ("D", 2.2, 0.12), ("s", 2.2, 0.36))  # mark, size, and place in a row
 _GAPS = {"one": "\n", "two": " "}  # between the halves of an axis label
 
 
-def draw_forest(rows: Sequence[ForestRow], stacks: Sequence[str], columns: str = "two") -> Figure:
-    """Draw a row per claim: the claimed range as a band, and the effects of the stacks on it.
+def draw_forest(rows: Sequence[ForestRow], places: Sequence[str], columns: str = "two") -> Figure:
+    """Draw a row per claim: the claimed range as a band, and the effects at the places on it.
 
     Args:
+        places: names of up to three stacks, or stacks in one kind of worlds.
         columns: `one` on a narrow screen, otherwise `two`.
     """
     from matplotlib.lines import Line2D
@@ -135,26 +137,28 @@ def draw_forest(rows: Sequence[ForestRow], stacks: Sequence[str], columns: str =
                         fontsize=6.2, labelpad=1)  # fmt: skip
     marks: list[Patch | Line2D] = [Patch(color=_BAND, label="the paper's range")]
     marks += [
-        Line2D([], [], marker=mark, markersize=size, color=NOTE, linewidth=0.9, label=stack,
+        Line2D([], [], marker=mark, markersize=size, color=NOTE, linewidth=0.9, label=name,
                markerfacecolor=NOTE if not place else "none")
-        for place, (stack, mark, size) in enumerate(zip(stacks, "oD", (3.2, 2.4), strict=False))
+        for place, (name, (mark, size, _)) in enumerate(zip(places, _MARKS, strict=False))
         if any(any(row.effects[place : place + 1]) for row in rows)
     ]  # fmt: skip
-    legend_above(figure, handles=marks, ncols=3, fontsize=6.2, handlelength=1.4, columnspacing=1.0)
+    wide = 3 if len(marks) <= 3 else 2
+    legend_above(figure, handles=marks, ncols=wide, fontsize=6.2, handlelength=1.4,
+                 columnspacing=1.0)  # fmt: skip
     return figure
 
 
 def _effect(axes: Axes, y: float, effect: Interval, scale: float, place: int, verdict: str) -> None:
-    """Draw the effect of stack number `place` with its interval.
+    """Draw the effect at place number `place` with its interval.
 
-    The effect of the first stack has the colour of the verdict.
+    The effect at the first place has the colour of the verdict.
     """
     colour = _VERDICTS.get(verdict, NOTE) if not place else NOTE
-    height = y - 0.14 if not place else y + 0.26
-    width, size = (1.3, 3.2) if not place else (0.6, 2.2)
+    mark, size, down = _MARKS[place]
+    height, width = y + down, 0.6 if place else 1.3
     low, high = scale * effect.low, scale * effect.high
     axes.hlines(height, low, high, color=colour, linewidth=width)
-    axes.plot(scale * effect.value, height, "o" if not place else "D", color=colour,
+    axes.plot(scale * effect.value, height, mark, color=colour,
               markersize=size, markerfacecolor=colour if not place else "none",
               markeredgewidth=0.6)  # fmt: skip
 

@@ -91,7 +91,7 @@ class McNemar:
         if weights is None:
             return test
         weighted = weights * changes
-        return WeightedMcNemar(
+        return _WeightedMcNemar(
             **{**asdict(test), "p_value": sign_flips(weighted.tolist())},
             difference=float(weighted.sum() / weights.sum()) if len(weighted) else math.nan,
         )
@@ -108,7 +108,7 @@ class McNemar:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WeightedMcNemar(McNemar):
+class _WeightedMcNemar(McNemar):
     """McNemar's test of a stratified sample, with the weighted difference of success rates."""
 
     difference: float = field()

@@ -124,7 +124,9 @@ def test_an_export_of_an_earlier_version_is_read_as_one_of_this(export, tmp_path
     rows = [None, "1 15;19 24"]
     pq.write_table(table.slice(0, 2).set_column(place, "struck_bits", pa.array(rows)), old)
     assert read_export(old)["struck_bits"].to_pylist() == [None, [[1, 15], [19, 24]]]
-    assert read_export(export).equals(table)
+    paths = table.schema.get_field_index("path")
+    unread = table.set_column(paths, "path", pa.nulls(len(table), pa.string()))
+    assert read_export(export).equals(unread)  # a path in a file may lead anywhere
     pq.write_table(table.slice(0, 1).set_column(place, "struck_bits", pa.array(["x"])), old)
     with pytest.raises(RecordError, match="cannot be read"):
         read_export(old)

@@ -14,7 +14,7 @@ from pathlib import Path
 import click
 import pytest
 from fake_autopilot import FakePX4
-from pyarrow.parquet import read_schema
+from pyarrow.parquet import read_schema, read_table
 from test_code_blocks import WIDEST
 
 from mavfi_cli import cli
@@ -127,6 +127,14 @@ def test_the_reference_names_everything_in_a_run_folder(short_flight):
     columns = {name for each in tables for name in read_schema(each).names}
     result = json.loads((short_flight.path / "result.json").read_text())
     assert (columns | set(result)) - told == set()
+
+
+def test_no_committed_export_names_a_folder_of_the_computer_that_flew_it():
+    exports = [*ROOT.glob("docs/results/*.parquet")]
+    tables = [read_table(each) for each in exports if "path" in read_schema(each).names]
+    paths = {path for table in tables for path in table["path"].to_pylist() if path}
+    assert paths
+    assert {path for path in paths if not re.fullmatch(r"runs/[\w.-]+", path)} == set()
 
 
 def test_the_reference_names_every_column_of_an_export():

@@ -130,8 +130,9 @@ def test_one_stack_has_no_arms():
 # When a dead node comes back ----------------------------------------------------------------------
 
 
-def under(restart_s, seed, **how):
-    return row("planning", instruction=True, seed=seed, config={"node_restart_s": restart_s}, **how)
+def under(restart_s, seed, config=None, **how):
+    rule = {"node_restart_s": restart_s, **(config or {})}
+    return row("planning", instruction=True, seed=seed, config=rule, **how)
 
 
 def test_restart_rules_are_compared_on_the_faults_that_all_of_them_flew():
@@ -150,6 +151,23 @@ def test_restart_rules_are_compared_on_the_faults_that_all_of_them_flew():
     }
     assert (found.golden.counts, found.paper) == ("4 of 4", [95.0, 88.3])
     assert found.p_value == 0.5
+
+
+def test_restart_rules_in_fixed_worlds_are_compared_apart_from_those_in_others():
+    rows = []
+    for config in ({}, {"world_seed": 4}):
+        lost = LOST if config else {}
+        rows += [
+            row(seed=1, config=config),
+            under(1.0, 1, config),
+            under(3600.0, 1, config, **lost),
+        ]
+    fixed, many = restarts(flights(rows))
+    assert fixed.place == "mavbench, fixed worlds"
+    assert many.place == "mavbench, another world for each seed"
+    assert [each.counts for each in fixed.success.values()] == ["1 of 1", "0 of 1"]
+    assert [each.counts for each in many.success.values()] == ["1 of 1", "1 of 1"]
+    assert fixed.golden.counts == many.golden.counts == "1 of 1"
 
 
 def test_one_restart_rule_is_no_comparison():

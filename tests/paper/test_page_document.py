@@ -160,6 +160,37 @@ def test_another_stack_is_compared_in_the_same_scenes():
     assert (cell.effect, cell.counts) == ("helps", "harmful 0 of 10 instead of 10 of 10")
 
 
+def test_a_stack_in_both_kinds_of_worlds_is_judged_for_each_kind():
+    rows = []
+    for seed in range(1, 21):
+        for config, lost in ({"world_seed": 3}, LOST), ({}, {}):
+            rows.append(row(seed=seed, config=config))
+            rows.append(row("planning", seed=seed, config=config, instruction=True, **lost))
+        config = {"stack": "hardened"}
+        rows += [row(seed=seed, config=config),
+                 row("planning", seed=seed, config=config, instruction=True)]  # fmt: skip
+    told = document(evidence(rows))
+    fixed, many, hardened = told.places
+    assert (told.place, told.stack) == ("mavbench, fixed worlds", "mavbench")
+    assert (fixed, many) == (told.place, "mavbench, another world for each seed")
+    claim = next(each for each in told.claims if each.claim.name == "table4-sparse")
+    found = {place: effect_of(claim, place).value for place in (fixed, many, hardened)}
+    assert found == {fixed: 1.0, many: 0.0, hardened: 0.0}
+    assert {*told.verdicts()} == {fixed, many, hardened, ISOLATED}
+    assert told.populations[fixed].startswith("worlds: fixed (sparse 3)")
+    item = next(each for each in told.items if each.item.name == "fig7")
+    assert item.missing[fixed] == "mavfi reproduce fig7 --stack mavbench"
+    assert item.missing[many] == "mavfi reproduce fig7 --stack mavbench --worlds many"
+    # Of both kinds, only the flights in the same worlds are compared with those of another stack.
+    (other,) = (each for each in told.protections if "instead of" in each.name)
+    assert other.name == f"hardened instead of {many}"
+    cell = other.against["a fault in an instruction, silent"]
+    assert (cell.effect, cell.counts) == (
+        "nothing to undo",
+        "harmful 0 of 20 instead of 0 of 20",
+    )
+
+
 @pytest.mark.parametrize(
     ("lost", "advice"),
     [(8, "wrong value in a state.* helps: Gaussian detector"),

@@ -14,6 +14,7 @@ from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.paper.document import document
+from mavfi_cli.paper.items import stack_of
 from mavfi_cli.paper.sources import Evidence
 from mavfi_cli.report.campaign import flights_file
 
@@ -217,6 +218,17 @@ def test_a_mission_in_two_places_counts_once(export):
     found = Evidence.gather(places)
     assert len(found.flights()) == len(found.flights("mavbench")) == 2
     assert len(found.flights("hardened")) == 0
+
+
+def test_a_stack_is_split_by_kind_of_world_only_if_it_has_both(export):
+    fixed = row(seed=1, config={"world_seed": 2})
+    ours = row(seed=1, config={"stack": "hardened", "world_seed": 2})
+    found = Evidence.gather([export("one.parquet", row(seed=1), fixed, ours)])
+    places = found.by_place(["mavbench", "hardened"])
+    assert {place: len(flown) for place, flown in places.items()} == {
+        "mavbench, fixed worlds": 1, "mavbench, another world for each seed": 1, "hardened": 1,
+    }  # fmt: skip
+    assert [stack_of(place) for place in places] == ["mavbench", "mavbench", "hardened"]
 
 
 def test_a_mission_that_could_not_begin_does_not_hide_its_flight(export):

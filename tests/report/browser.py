@@ -74,7 +74,9 @@ class Browser:
         text = text.replace("<head>", f"<head>{_LISTEN}", 1).replace("</body>", f"{_PROBE}</body>")
         frame = f'<iframe style="width: {width}px; height: 900px; border: 0" srcdoc="'
         outside = self._folder / "outside.html"  # a window is at least 500 px wide, a frame is not
-        outside.write_text(f'<body>{frame}{html.escape(text)}"></iframe>', encoding="utf-8")
+        outside.write_text(
+            f'<meta charset="utf-8"><body>{frame}{html.escape(text)}"></iframe>', encoding="utf-8"
+        )
         done = self._run("--dump-dom", outside.as_uri())
         told = re.search(r'<pre id="probe">(.*?)</pre>', done.stdout, re.DOTALL)
         console = [line for line in done.stderr.splitlines() if ":CONSOLE" in line]

@@ -263,7 +263,7 @@ def struck_nodes(
     *,
     profiles: Path,
     omit: Callable[[str], None] = lambda _reason: None,
-) -> dict[int, StruckInjection]:
+) -> dict[int, StruckNode]:
     """Strike the nodes of several missions, each in a rehearsal: the node without its flight.
 
     Args:
@@ -283,7 +283,7 @@ def struck_nodes(
     by_node: dict[str, list[int]] = {}
     for number, request in requests.items():
         by_node.setdefault(request.node(), []).append(number)
-    injections = dict[int, StruckInjection]()
+    injections = dict[int, StruckNode]()
 
     def strike(node: _GoldenNode, numbers: Sequence[int]) -> None:
         drawn = {number: node.draw(requests[number]) for number in numbers}
@@ -298,7 +298,7 @@ def struck_nodes(
             except (MavfiError, OSError) as error:
                 omit(str(error))
             else:
-                injections[number] = StruckInjection(struck, node.name, invocation.order)
+                injections[number] = _StruckInjection(struck, node.name, invocation.order)
 
     def work(_armed: Callable[[], None]) -> None:
         for name, numbers in by_node.items():
@@ -520,7 +520,7 @@ class InstructionInjection(NoInjection):
             self._spawned.kill()
 
 
-class StruckInjection(StruckNode):
+class _StruckInjection(StruckNode):
     """Injection of an instruction-level fault that has struck its node in a rehearsal."""
 
     def __init__(self, struck: Struck, node: str, order: int) -> None:
