@@ -179,15 +179,16 @@ def _parts(
     blanket, spans = _Blanket(tracee, scope), scope.bounds
     ends = (int(stop[0]), *stop[2:].tolist())
     blocks = None if reads_own_code else stepper.Blocks(blanket.code, ends)
+    trace = np.empty(_CHUNK, np.int64)
     try:
         while tracee.ended is None:
-            trace, target = np.empty(_CHUNK, np.int64), (tracee.tid, tracee.group)
+            target = tracee.tid, tracee.group
             tracee.registers.forget()
             if blocks is None:
                 recorded, why, report = stepper.record_steps(*target, spans, trace, stop)
             else:
                 recorded, why, report = blocks.record(*target, trace, stop)
-            yield trace[:recorded]
+            yield trace[:recorded].copy()
             if why == stepper.WINDOW_END:
                 return
             if blocks is not None and why == stepper.NEW_BLOCK:
