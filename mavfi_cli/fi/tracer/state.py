@@ -30,7 +30,8 @@ _OWN = np.uint64(1 << 56 | 1 << 62)  # flags: no other process maps the page; it
 _RED_ZONE = 128  # bytes below the stack pointer that a function may use
 _KEPT_X87, _KEPT_SSE = slice(0, 5), slice(24, 28)  # control, status and tags; MXCSR
 _KERNEL_OWN = ("[vvar]", "[vvar_vclock]", "[vsyscall]", "[vdso]")
-_SIGNALS = re.compile(r"^(?:Sig|Shd|Threads)\w*:.*", re.MULTILINE)
+# SigQ counts the queued signals of the user, in all processes.
+_SIGNALS = re.compile(r"^(?:Sig(?!Q)|Shd|Threads)\w*:.*", re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
