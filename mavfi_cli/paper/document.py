@@ -157,11 +157,12 @@ class Document:
     Attributes:
         places: stacks, or a stack in each kind of worlds if the missions have both kinds. The page
             shows the first one, and collapses the others.
+        answers: for each place, a sentence on how far it reproduces the paper.
     """
 
     version: str
     places: Sequence[str]
-    answer: str
+    answers: Mapping[str, str]
     crashes: str
     extent: str
     problems: Sequence[str]
@@ -200,6 +201,11 @@ class Document:
     def stack(self) -> str:
         """The stack of `place`."""
         return stack_of(self.place)
+
+    @property
+    def answer(self) -> str:
+        """The sentence on how far `place` reproduces the paper."""
+        return self.answers[self.place]
 
     def reason(self, judged: JudgedClaim) -> str:
         """Return the known reason why a claim is contradicted at `place`, or an empty string."""
@@ -247,7 +253,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
     return Document(
         version=__version__,
         places=places,
-        answer=answer(claims, places[0]),
+        answers={place: answer(claims, place) for place in places},
         crashes=crash_sentence(claims, places[0], flights[places[0]]),
         extent=_extent(flights, kernels, claims),
         problems=evidence.problems,
