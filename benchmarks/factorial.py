@@ -6,7 +6,8 @@ Reads exports of `docs/results/factorial-many.toml` and `factorial-fixed.toml`. 
 the rule, which was written before the flights. A mission counts if its golden flight succeeded, and
 is lost if it does not end in success. The effect of a factor is the share of missions that its
 second level loses, minus that of its first level, as a mean over worlds and seeds. Intervals are
-bootstrap intervals over worlds and seeds, 95 %.
+bootstrap intervals over worlds and seeds, 95 %. The effects of the factors that matter are printed
+again at each level of the others; these were not part of the rule.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from exported import PAIRED, Key, Row, flown, golden_lost, key, lost, share
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import holm, sign_flips
 
+Cells = dict[tuple[bool, ...], list[bool]]  # whether each mission was lost, by levels
 PAPER_POINTS = 100.0 * (380 / 400 - 1058 / 1200)  # Table IV, all worlds: golden minus faults
 FACTORS = {
     "worlds": ("one for each seed", "fixed"),
@@ -44,14 +46,14 @@ def levels(row: Row, *, fixed: bool) -> tuple[bool, ...]:
     )
 
 
-def outcomes(parts: list[str], *, fixed: bool) -> dict[Key, dict[tuple[bool, ...], list[bool]]]:
+def outcomes(parts: list[str], *, fixed: bool) -> dict[Key, Cells]:
     """Return whether each mission with a fault was lost, by world and seed, then by levels.
 
     Missions whose golden flight is lost are left out.
     """
     rows = flown(parts)
     golden = golden_lost(rows)
-    cells: dict[Key, dict[tuple[bool, ...], list[bool]]] = collections.defaultdict(dict)
+    cells: dict[Key, Cells] = collections.defaultdict(dict)
     for row in rows:
         if row["injected"] != "golden" and golden.get(key(row, PAIRED)) is False:
             cell = cells[key(row, ("world", "seed"))]
@@ -85,9 +87,18 @@ def main() -> None:
             f"| {name} | {' | '.join(ends)} | {effect.value:+.1f} ({effect.low:.1f} to "
             f"{effect.high:.1f}) | {effect.value / PAPER_POINTS:.0%} | {p:.2g} |"
         )
+    names = [*FACTORS]
+    matter = [place for place, p in enumerate(holm(tests)) if p < 0.05]
+    for place, other in itertools.permutations(matter, 2):
+        for level, end in enumerate(FACTORS[names[other]]):
+            at = [{c: hits for c, hits in block.items() if c[other] is bool(level)}
+                  for block in whole]  # fmt: skip
+            effect = interval(100.0 * np.array([change(block, place) for block in at]))
+            print(f"{names[place]}, if {names[other]}: {end}: {effect.value:+.1f} points "
+                  f"({effect.low:.1f} to {effect.high:.1f})")  # fmt: skip
 
 
-def change(block: dict[tuple[bool, ...], list[bool]], place: int) -> float:
+def change(block: Cells, place: int) -> float:
     """Return the loss at a factor's second level minus that at its first, mean over the others."""
     means = [
         [np.mean(hits) for corner, hits in block.items() if corner[place] is level]
