@@ -4,9 +4,9 @@ r"""Counts the missions that instruction-level faults lose, apart for silent fau
         --by world label_node_restart_s detector
 
 Reads exports of campaigns (`mavfi campaign export`). A mission counts if its golden flight (the
-same world, world seed, seed, stack and platform) succeeded, and if its fault was read. A fault is
-dead if its node ended, and silent otherwise. A mission is lost if it does not end in success.
-Intervals are Wilson's, 95 %.
+same world, world seed, seed, stack and platform) succeeded, and if its fault was read or ended its
+node. A fault is dead if its node ended, and silent otherwise. A mission is lost if it does not end
+in success. Intervals are Wilson's, 95 %.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ def main() -> None:
     golden = golden_lost(rows)
     cells: dict[tuple[str, ...], list[Row]] = collections.defaultdict(list)
     for row in rows:
-        counts = row["level"] == "instruction" and row["activation"] == "read"
-        if counts and golden.get(key(row, PAIRED)) is False:
+        effect = row["activation"] == "read" or row["node_ended"]
+        if row["level"] == "instruction" and effect and golden.get(key(row, PAIRED)) is False:
             cells[tuple(str(row.get(name) or "") for name in given.by)].append(row)
     print(f"| {' | '.join(given.by)} | lost | lost, dead node | lost, silent |")
     print("|---" * (len(given.by) + 3) + "|")
