@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sitl.vehicle.cascade import control_step
+from sitl.vehicle.cascade import SETPOINT_SIZE, control_step
 from sitl.vehicle.profile import PROFILES, load_profile
 from sitl.vehicle.vehicle import Quadrotor
 
@@ -29,7 +29,8 @@ def median_us(work: Callable[[], object]) -> float:
 
 def main() -> None:
     """Time every shipped vehicle profile in forward flight, and print the times."""
-    setpoint = np.array([np.nan] * 3 + [1.0, 0.5, -0.2] + [np.nan] * 3 + [0.3, np.nan])
+    setpoint = np.full(SETPOINT_SIZE, np.nan)
+    setpoint[3:6], setpoint[9] = (1.0, 0.5, -0.2), 0.3
     for name in PROFILES.names:
         vehicle = Quadrotor(load_profile(name), position_enu_m=(0.0, 0.0, 5.0), yaw_enu_rad=0.0)
         for _ in range(STEPS):

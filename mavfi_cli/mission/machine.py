@@ -60,7 +60,7 @@ from sitl.vehicle.profile import load_profile
 from sitl.vehicle.vehicle import Quadrotor
 import numpy, sys
 vehicle = Quadrotor(load_profile("solo"), position_enu_m=numpy.zeros(3), yaw_enu_rad=0.0)
-target = numpy.full(11, numpy.nan)
+target = numpy.full(19, numpy.nan)
 target[3:6] = 0.0, 0.0, -1.0
 for _ in range(500):
     vehicle.step(target, True)

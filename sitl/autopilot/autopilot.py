@@ -28,6 +28,7 @@ from sitl.vehicle.truth import Truth
 COMPONENT = 1
 _PARAMETERS_A_TICK = 20  # about 1000 per second, as in PX4
 _STRAIGHT_DOWN_MPS = 0.3
+_STRAIGHT_DOWN_M = 0.5  # a place below the vehicle that is no farther away horizontally
 _TEXTS_A_TICK = 10  # further texts are dropped, so that bad messages cannot cause a flood of them
 
 
@@ -138,7 +139,11 @@ class Autopilot(Links):
         if self.commander.mode is not FlightMode.OFFBOARD:
             return True
         north, east, down = self.snapshot.setpoint[3:6].tolist()
-        return bool(math.hypot(north, east) < _STRAIGHT_DOWN_MPS and down > 0.0)
+        if math.hypot(north, east) < _STRAIGHT_DOWN_MPS and down > 0.0:
+            return True
+        place = self.snapshot.truth.position_ned_m
+        north, east, down = (self.snapshot.setpoint[:3] - place).tolist()
+        return bool(math.hypot(north, east) < _STRAIGHT_DOWN_M and down > 0.0)
 
     def fly(self) -> None:
         """Run the active mode: set the setpoint and the motors until the next stamp."""
@@ -152,7 +157,8 @@ class Autopilot(Links):
             self._guidance = begin(commander.mode, now)
             self._flown = commander.mode
         self._guidance(now, out)
-        flies = not commander.landed or (now.spooled_up and climbs(out, now.truth))
+        ready = now.spooled_up or not math.isnan(out[11])  # PX4 does not wait for a thrust
+        flies = not commander.landed or (ready and climbs(out, now.truth))
         now.setpoint, now.motors_on = out, flies and not commander.terminated
         self.flush_texts()
 

@@ -325,10 +325,10 @@ class Commander:
 
 # State of the flight ------------------------------------------------------------------------------
 
-# Position, velocity, acceleration (NED; m, m/s, m/s^2), yaw (rad) and yaw rate (rad/s) (11,); NaN
-# means not controlled.
+# Position, velocity, acceleration (NED; m, m/s, m/s^2), yaw (rad), yaw rate (rad/s), thrust (0..1),
+# attitude (w x y z, body FRD to NED), body rates (rad/s) (19,); NaN means not controlled.
 Setpoint = Vector
-_UNSET = np.full(11, math.nan)
+_UNSET = np.full(19, math.nan)
 
 
 def no_setpoint() -> Setpoint:

@@ -28,6 +28,8 @@ _TAKEOFF_FIRST_MPS = 0.4
 _TAKEOFF_NEAR_M = 0.2
 _ARRIVED_M = 0.5
 _STICK_INVALID = 32767
+_THRUST = 11  # index of the thrust in a setpoint
+_LIFTING = 0.1  # a setpoint with a larger thrust wants to leave the ground
 
 
 # Guidance of a flight mode, from entering the mode to leaving it. At every tick it writes its
@@ -38,10 +40,10 @@ Guidance = Callable[[Snapshot, Setpoint], None]
 def climbs(out: Setpoint, truth: Truth) -> bool:
     """Return True if the position or the velocity of a setpoint requests a climb.
 
-    A component that is NaN requests nothing.
+    So does a thrust. A component that is NaN requests nothing.
     """
     lift = out[2] - truth.position_ned_m[2]
-    return bool(out[5] < -_CLIMB_MPS or lift < -_CLIMB_M)
+    return bool(out[5] < -_CLIMB_MPS or lift < -_CLIMB_M or out[_THRUST] > _LIFTING)
 
 
 def _approach(delta: Vector, *, speed_mps: float, acceleration_mps2: float) -> Vector:
@@ -205,6 +207,9 @@ def _follow_companion(now: Snapshot, out: Setpoint) -> None:
     Along an axis with neither position nor velocity, the vehicle stops.
     """
     values = now.offboard.tolist()
+    if not math.isnan(values[_THRUST]):  # an attitude or body rates, which PX4 does not limit
+        out[:] = values
+        return
     for axis in range(3):
         if math.isnan(values[axis]) and math.isnan(values[3 + axis]):
             values[3 + axis] = 0.0

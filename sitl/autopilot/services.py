@@ -37,6 +37,8 @@ _ABSOLUTE_ALTITUDE = (0, 5)
 _ABOVE_HOME = (3, 6, 10, 11)  # includes the frames above terrain, as the ground is flat
 _IGNORE_POSITION, _IGNORE_VELOCITY, _IGNORE_ACCELERATION = 0x0007, 0x0038, 0x01C0
 _FORCE, _IGNORE_YAW, _IGNORE_YAW_RATE = 0x0200, 0x0400, 0x0800
+# Type mask bits of SET_ATTITUDE_TARGET.
+_IGNORE_TILT_RATES, _THRUST_VECTOR, _IGNORE_THRUST, _IGNORE_ATTITUDE = 3, 32, 64, 128
 _STEEPEST = 100.0  # m/s^2 or rad/s
 
 
@@ -280,14 +282,57 @@ def _position_target(autopilot: Autopilot, message: Any, link: Link) -> None:
     except ValueError as error:
         autopilot.commander.queue_text(Severity.CRITICAL, f"{message.get_type()} {error}")
         return
+    _follow(autopilot, message, link, setpoint)
+
+
+def _attitude_target(autopilot: Autopilot, message: Any, link: Link) -> None:
+    try:
+        setpoint = _attitude_setpoint(message)
+    except ValueError as error:
+        autopilot.commander.queue_text(Severity.CRITICAL, f"{message.get_type()} {error}")
+        return
+    _follow(autopilot, message, link, setpoint)
+
+
+def _follow(autopilot: Autopilot, message: Any, link: Link, setpoint: Setpoint) -> None:
+    """Make a setpoint the newest one of the companion, if its sender may give setpoints now."""
+    now = autopilot.snapshot
     silence_us = autopilot.parameters.effective("COM_OF_LOSS_T") * 1e6
     if autopilot.authority.follows(message, link, now.stamp_us, silence_us):
         now.offboard = setpoint
         autopilot.commander.input_arrived(FlightMode.OFFBOARD)
 
 
+def _attitude_setpoint(message: Any) -> Setpoint:
+    """Return the setpoint (19,) that a SET_ATTITUDE_TARGET message gives.
+
+    It has a thrust, and either an attitude, with an optional yaw rate, or body rates.
+
+    Raises:
+        ValueError: the type mask or a value is not supported.
+    """
+    mask, out = message.type_mask, no_setpoint()
+    if mask & (_IGNORE_THRUST | _THRUST_VECTOR):
+        raise ValueError("without a collective thrust not supported")
+    if not 0.0 <= message.thrust <= 1.0:
+        raise ValueError("thrust invalid")
+    out[11] = message.thrust
+    rates = message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate
+    if not mask & _IGNORE_ATTITUDE:
+        norm = math.sqrt(math.fsum(part * part for part in message.q))
+        if not 0.5 < norm < 2.0:
+            raise ValueError("quaternion invalid")
+        out[12:16] = message.q
+        _fill(out, 16, rates, mask | _IGNORE_TILT_RATES, _STEEPEST)
+    elif mask & _IGNORE_TILT_RATES:
+        raise ValueError("invalid")
+    else:
+        _fill(out, 16, rates, mask, _STEEPEST)
+    return out
+
+
 def setpoint_of(message: Any, heading_rad: float, origin: Origin, home_down_m: float) -> Setpoint:
-    """Return the setpoint (11,), in NED, that a SET_POSITION_TARGET message gives.
+    """Return the setpoint (19,), in NED, that a SET_POSITION_TARGET message gives.
 
     A BODY_NED setpoint is rotated by the heading (rad, from north). The altitude of a global
     setpoint is above sea level or above home, depending on the frame. Raises ValueError if frame or
@@ -456,11 +501,7 @@ ADDRESSED: Mapping[int, _Service] = {
     ),
     dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: _position_target,
     dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT: _position_target,
-    dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: (
-        lambda autopilot, *_: autopilot.commander.queue_text(
-            Severity.CRITICAL, "SET_ATTITUDE_TARGET not supported"
-        )
-    ),
+    dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: _attitude_target,
     dialect.MAVLINK_MSG_ID_COMMAND_LONG: _execute,
     dialect.MAVLINK_MSG_ID_COMMAND_INT: _execute,
 }

@@ -59,6 +59,7 @@ _CAPABILITIES = (
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_INT
     | dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     | dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    | dialect.MAV_PROTOCOL_CAPABILITY_SET_ATTITUDE_TARGET
     | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_GLOBAL_INT
     | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
     | dialect.MAV_PROTOCOL_CAPABILITY_FLIGHT_TERMINATION
@@ -152,7 +153,7 @@ def _position_target_local_ned(s: Snapshot) -> Any:
     """Return POSITION_TARGET_LOCAL_NED with the active setpoint, as in PX4."""
     unset = np.isnan(s.setpoint)
     mask = sum(bits for start, bits in _ZERO_MASKS if unset[start : start + 3].all())
-    sent = np.where(unset, 0.0, s.setpoint).tolist()
+    sent = np.where(unset, 0.0, s.setpoint).tolist()[:11]
     if unset[9]:
         sent[9] = s.truth.euler_rad[2]
     return dialect.MAVLink_position_target_local_ned_message(

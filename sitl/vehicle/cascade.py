@@ -21,10 +21,13 @@ from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.frames import Vector
 from sitl.vehicle.truth import T_ON_GROUND, T_POSITION, T_QUATERNION, T_RATES, T_VELOCITY
 
-# Setpoint (11,): NED, m, m/s, m/s^2, rad, rad/s; NaN means not controlled.
+# Setpoint (19,): NED, m, m/s, m/s^2, rad, rad/s; NaN means not controlled. With a thrust, a share
+# of the largest motor command, the vehicle follows an attitude (body FRD to NED) or body rates,
+# and nothing that comes before the thrust.
 SP_POSITION, SP_VELOCITY, SP_ACCELERATION = 0, 3, 6
 SP_YAW, SP_YAW_RATE = 9, 10
-SETPOINT_SIZE = 11
+SP_THRUST, SP_ATTITUDE, SP_BODY_RATES = 11, 12, 16  # 1, 4 (w x y z), 3
+SETPOINT_SIZE = 19
 
 # A measurement (33,) is the vehicle's truth, in the order of `sitl.vehicle.truth`.
 
@@ -126,13 +129,13 @@ def _limit_horizontal(vector: Vector, start: int, limit: float) -> None:
 
 @compiled
 def clean_setpoint(setpoint: Vector, gains: Vector) -> Vector:
-    """Return a copy of a setpoint (11,) that is limited to what the vehicle can do.
+    """Return the first part (11,) of a setpoint, limited to what the vehicle can do.
 
     Velocity is limited to the horizontal speed (norm) and to the climb and descent limits, and
     acceleration and yaw rate to their limits. Yaw is wrapped into [-pi, pi). Values that are not
     finite become NaN.
     """
-    clean = np.empty(SETPOINT_SIZE)
+    clean = np.empty(SP_THRUST)
     for index in range(SP_YAW):  # position, then velocity and acceleration
         limit = FARTHEST_M if index < SP_VELOCITY else LARGEST_INPUT
         clean[index] = _finite_or_nan(setpoint[index], limit)
@@ -244,7 +247,13 @@ def acceleration_target(
 @compiled
 def rotation(measurement: Vector) -> Vector:
     """Return the rotation matrix (3, 3) from body FRD to NED for the measured attitude."""
-    w, x, y, z = measurement[T_QUATERNION : T_QUATERNION + 4]
+    return _matrix_of(measurement[T_QUATERNION : T_QUATERNION + 4])
+
+
+@compiled
+def _matrix_of(quaternion: Vector) -> Vector:
+    """Return the rotation matrix (3, 3) of a unit quaternion (4,) w x y z."""
+    w, x, y, z = quaternion
     matrix = np.empty((3, 3))
     matrix[0, 0] = 1.0 - 2.0 * (y * y + z * z)
     matrix[0, 1] = 2.0 * (x * y - w * z)
@@ -405,6 +414,18 @@ def throttle(share: float, gains: Vector) -> float:
 
 
 @compiled
+def _thrust_share(command: float, gains: Vector) -> float:
+    """Return the share of a rotor's maximum static thrust for a motor command in [0, 1].
+
+    This is the inverse of `throttle`.
+    """
+    above = max(command - gains[G_THROTTLE], 0.0)
+    linear, quadratic = gains[G_THROTTLE + 1], gains[G_THROTTLE + 2]
+    speed: float = 2.0 * above / (linear + math.sqrt(linear * linear + 4.0 * quadratic * above))
+    return min(speed * speed, 1.0)
+
+
+@compiled
 def mix(collective_n: float, torque_nm: Vector, gains: Vector) -> Vector:
     """Return the motor commands (4,), in [0, 1], for a collective thrust and a torque (3,)."""
     commands = thrust_shares(collective_n, torque_nm, gains)
@@ -428,6 +449,50 @@ def _resting_state(measurement: Vector, matrix: Vector) -> Vector:
 
 
 @compiled
+def _attitude_step(
+    state: Vector,
+    measurement: Vector,
+    matrix: Vector,
+    setpoint: Vector,
+    gains: Vector,
+    on_ground: bool,
+) -> tuple[Vector, Vector]:
+    """Return what `control_step` returns, for a setpoint with a thrust.
+
+    On the ground, the vehicle idles until the thrust exceeds its weight. The references of the
+    velocity loops follow the vehicle, so that these loops can take over.
+    """
+    command = _clip(setpoint[SP_THRUST], 0.0, 1.0)
+    collective = 4.0 * gains[G_ROTOR_THRUST] * _thrust_share(command, gains)
+    resting = _resting_state(measurement, matrix)
+    if on_ground and collective <= gains[G_MASS] * gains[G_GRAVITY]:
+        return resting, np.full(4, throttle(IDLE_SHARE, gains))
+    new = state.copy() if state[S_FLYING] > 0.5 else resting
+    new[S_FLYING] = 1.0
+    new[:S_RATE_INTEGRAL] = resting[:S_RATE_INTEGRAL]
+    new[S_LAGGED_FORWARD : S_LAGGED_FORWARD + 3] = 0.0
+    rates = np.zeros(3)
+    norm = math.sqrt((setpoint[SP_ATTITUDE : SP_ATTITUDE + 4] ** 2).sum())
+    if 1.0e-6 < norm < math.inf:
+        wanted = _matrix_of(setpoint[SP_ATTITUDE : SP_ATTITUDE + 4] / norm)
+        rates = tilt_rates(-wanted[:, 2], matrix, gains)
+        clean = np.full(SP_THRUST, math.nan)
+        clean[SP_YAW] = math.atan2(wanted[1, 0], wanted[0, 0])
+        clean[SP_YAW_RATE] = setpoint[SP_BODY_RATES + 2]
+        turn = _heading_rate(clean, math.atan2(matrix[1, 0], matrix[0, 0]), new, gains)
+        for axis in range(3):
+            rates[axis] += matrix[2, axis] * turn
+    else:
+        new[S_HEADING], new[S_HEADING_RATE] = resting[S_HEADING], 0.0
+        for axis in range(3):
+            limit = gains[G_YAW_RATE_LIMIT if axis == 2 else G_TILT_RATE_LIMIT]
+            rate = setpoint[SP_BODY_RATES + axis]
+            rates[axis] = _clip(rate, -limit, limit) if math.isfinite(rate) else 0.0
+    moment = _torque(rates, measurement, new, gains, not on_ground)
+    return new, mix(collective, moment, gains)
+
+
+@compiled
 def control_step(
     state: Vector, measurement: Vector, setpoint: Vector, gains: Vector, armed: bool
 ) -> tuple[Vector, Vector]:
@@ -439,9 +504,11 @@ def control_step(
     matrix = rotation(measurement)
     if not armed:
         return _resting_state(measurement, matrix), np.zeros(4)
+    on_ground = measurement[T_ON_GROUND] > 0.5
+    if math.isfinite(setpoint[SP_THRUST]):
+        return _attitude_step(state, measurement, matrix, setpoint, gains, on_ground)
     clean = clean_setpoint(setpoint, gains)
     target = velocity_target(clean, measurement, gains)
-    on_ground = measurement[T_ON_GROUND] > 0.5
     climbing = target[2] < -LIFT_OFF_MPS
     if on_ground and not climbing:
         return _resting_state(measurement, matrix), np.full(4, throttle(IDLE_SHARE, gains))

@@ -228,9 +228,12 @@ class Quadrotor:
     def step(self, setpoint: Vector, armed: bool, count: int = 1) -> None:
         """Advance flight controller and physics by `count` steps. The motors stop unless `armed`.
 
-        The setpoint (11,) is x y z, vx vy vz, ax ay az, yaw, yaw rate in NED; m, m/s, m/s^2, rad,
-        rad/s. A component that is not finite is not controlled.
+        The setpoint (19,) is x y z, vx vy vz, ax ay az, yaw, yaw rate in NED; m, m/s, m/s^2, rad,
+        rad/s; then a thrust in 0..1, an attitude w x y z from body FRD to NED, and body rates,
+        rad/s. A component that is not finite is not controlled. With a thrust, only it and the
+        attitude, or the rates, are controlled.
         """
+        assert len(setpoint) == cascade.SETPOINT_SIZE  # compiled code does not check it
         commands, law = self._commands, (self._state, self._flat, setpoint, self._gains, armed)
         _control(*law, commands)
         for _ in range(count - 1):

@@ -47,6 +47,24 @@ def test_mavsdk_arms_takes_off_flies_offboard_and_lands(sitl, free_udp_port, fre
 
 
 @pytest.mark.slow
+def test_mavsdk_flies_attitudes(sitl, free_udp_port, free_tcp_port):
+    port = free_udp_port()
+    server = sitl("--world", "farm", "--link", f"udpout:127.0.0.1:{port}")
+    script = SCRIPT.with_name("mavsdk_attitude.py")
+    client = subprocess.run(
+        [sys.executable, str(script), f"udpin://127.0.0.1:{port}", str(free_tcp_port())],
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert client.returncode == 0, client.stderr
+    report, log = server.stop()
+    assert report["collision"] is None
+    assert log["position_enu_m"][:, 2].max() > 2.0
+    east = log["velocity_enu_mps"][:, 0]  # the vehicle faces north, so a roll to the right
+    assert east.max() > 2.0
+    assert log["on_ground"][-1]
+
+
+@pytest.mark.slow
 def test_the_script_of_the_page_flies_and_lands(sitl, free_udp_port, free_tcp_port, tmp_path):
     """As it is printed, but for the port on which MAVSDK's own server listens."""
     port = free_udp_port()

@@ -194,5 +194,12 @@ def test_ground_may_be_touched_when_landing_or_asked_straight_down(offboard, vel
     assert offboard.autopilot.may_touch_ground
     offboard.run(0.5, velocity_target)
     assert not offboard.autopilot.may_touch_ground
+    north, east, _ = offboard.vehicle.position_ned_m.tolist()
+    for away_m, touches in ((2.0, False), (0.1, True)):
+        place = {"type_mask": 2552, "x": north + away_m, "y": east, "z": 0.0}
+        offboard.run(0.02, lambda place=place: velocity_target(**place))
+        assert offboard.autopilot.may_touch_ground is touches
+    offboard.run(0.5, velocity_target)
+    assert not offboard.autopilot.may_touch_ground
     offboard.command(dialect.MAV_CMD_NAV_LAND)
     assert offboard.autopilot.may_touch_ground

@@ -21,8 +21,12 @@ def make_setpoint(
     acceleration=(FREE, FREE, FREE),
     yaw=FREE,
     yaw_rate=FREE,
+    thrust=FREE,
+    attitude=(FREE,) * 4,
+    body_rates=(FREE,) * 3,
 ):
-    return np.array([*position, *velocity, *acceleration, yaw, yaw_rate], dtype=np.float64)
+    followed = *position, *velocity, *acceleration, yaw, yaw_rate
+    return np.array([*followed, thrust, *attitude, *body_rates], dtype=np.float64)
 
 
 class Record:

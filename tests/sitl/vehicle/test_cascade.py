@@ -15,7 +15,7 @@ from sitl.vehicle.truth import T_ON_GROUND, T_QUATERNION, T_RATES, TRUTH_SIZE
 
 GAINS = {name: gains_for(load_profile(name), 0.004) for name in PROFILES.names}
 names = st.sampled_from(PROFILES.names)
-anything = st.lists(st.floats(), min_size=11, max_size=11).map(np.array)
+anything = st.lists(st.floats(), min_size=19, max_size=19).map(np.array)
 small = st.floats(-1.0, 1.0)
 
 

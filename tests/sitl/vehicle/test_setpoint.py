@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sitl.vehicle import cascade
-from sitl.vehicle.cascade import FARTHEST_M, clean_setpoint, wrap
+from sitl.vehicle.cascade import FARTHEST_M, SETPOINT_SIZE, clean_setpoint, wrap
 from sitl.vehicle.gains import gains_for
 from sitl.vehicle.profile import load_profile
 
@@ -42,7 +42,7 @@ def test_everything_is_limited(setpoint):
 @settings(deadline=None)  # the first call may compile
 @given(st.floats(-12.0, 12.0), st.floats(-12.0, 12.0))
 def test_speed_limit_keeps_the_direction(x, y):
-    setpoint = np.full(11, math.nan)
+    setpoint = np.full(SETPOINT_SIZE, math.nan)
     setpoint[3:5] = 10.0 * x, 10.0 * y
     clean = clean_setpoint(setpoint, GAINS)
     np.testing.assert_allclose(clean[3] * setpoint[4], clean[4] * setpoint[3], atol=1e-9)

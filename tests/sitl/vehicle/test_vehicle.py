@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.frames import enu_from_ned, flu_enu_from_frd_ned, yaw_from_quaternion
+from sitl.vehicle.cascade import SETPOINT_SIZE
 from sitl.vehicle.profile import load_profile
 from sitl.vehicle.vehicle import PHYSICS_DT_S, T_ON_GROUND, Quadrotor
 
@@ -93,7 +94,7 @@ def wandering(seconds):
             -0.3 + math.sin(0.3 * seconds),
             *(math.nan,) * 3,
             0.5 * seconds,
-            math.nan,
+            *(math.nan,) * 9,
         ]
     )
 
@@ -151,7 +152,7 @@ def test_prints_and_writes_nothing(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     vehicle = Quadrotor(load_profile("solo"), position_enu_m=(0, 0, 1.0), yaw_enu_rad=0.0)
     for _ in range(300):
-        vehicle.step(np.full(11, math.nan), True)  # noqa: FBT003
+        vehicle.step(np.full(SETPOINT_SIZE, math.nan), True)  # noqa: FBT003
     del vehicle
     assert os.listdir(tmp_path) == []
     captured = capfd.readouterr()
