@@ -1,82 +1,79 @@
-"""Attitude and body-rate setpoints, with a thrust."""
+"""Attitude laws: the force keeps its limits, and the rates turn the right way."""
 
 import math
 
 import numpy as np
 import pytest
-from conftest import Flight, make_setpoint
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 
-from sitl.vehicle.cascade import G_GRAVITY, G_MASS, G_ROTOR_THRUST, mix
+from mavfi_cli.core.frames import quaternion_from_euler, rotation_matrix
+from sitl.vehicle import cascade
+from sitl.vehicle.cascade import rotation, specific_force, tilt_rates
 from sitl.vehicle.gains import gains_for
 from sitl.vehicle.profile import PROFILES, load_profile
-from sitl.vehicle.truth import T_RATES
-from sitl.vehicle.vehicle import PHYSICS_DT_S
+from sitl.vehicle.truth import T_QUATERNION, TRUTH_SIZE
 
-LEVEL = (1.0, 0.0, 0.0, 0.0)
-
-
-def hovering(name):
-    """The motor command that carries the vehicle at rest."""
-    gains = gains_for(load_profile(name), PHYSICS_DT_S)
-    assert gains[G_MASS] * gains[G_GRAVITY] < 4.0 * gains[G_ROTOR_THRUST]
-    return mix(gains[G_MASS] * gains[G_GRAVITY], np.zeros(3), gains)[0]
+GAINS = {name: gains_for(load_profile(name), 0.004) for name in PROFILES.names}
+angles = st.floats(-3.0, 3.0)
+accelerations = st.lists(st.floats(-50.0, 50.0), min_size=3, max_size=3).map(np.array)
 
 
-@pytest.mark.parametrize("name", PROFILES.names)
-def test_the_thrust_is_the_motors_command(name):
-    flight = Flight(name).take_off()
-    for thrust in (0.3, 0.6, 0.9):
-        setpoint = make_setpoint(thrust=thrust, body_rates=(0.0, 0.0, 0.0))
-        flight.fly(setpoint, PHYSICS_DT_S)
-        assert flight.truth.motor_commands.mean() == pytest.approx(thrust, abs=0.02)
+def measured(quaternion):
+    measurement = np.zeros(TRUTH_SIZE)
+    measurement[T_QUATERNION : T_QUATERNION + 4] = quaternion
+    return measurement
 
 
-@pytest.mark.parametrize("name", PROFILES.names)
-def test_it_lifts_off_only_if_the_thrust_carries_it(name):
-    flight = Flight(name)
-    heights = []
-    for share in (0.9, 1.1):
-        setpoint = make_setpoint(thrust=share * hovering(name), attitude=LEVEL)
-        flight.fly(setpoint, 1.0)
-        heights.append(-flight.truth.position_ned_m[2] - flight.vehicle.profile.rest_height_m)
-    assert heights[0] < 0.01 < 0.05 < heights[1]
+@settings(deadline=None)  # the first call may compile
+@given(angles, st.floats(-1.5, 1.5), angles)
+def test_rotation_is_the_one_of_the_frames_module(roll, pitch, yaw):
+    quaternion = quaternion_from_euler(roll, pitch, yaw)
+    np.testing.assert_allclose(
+        rotation(measured(quaternion)), rotation_matrix(quaternion), rtol=0, atol=1e-14
+    )
 
 
-@pytest.mark.parametrize("name", PROFILES.names)
-@pytest.mark.parametrize(
-    ("roll_deg", "pitch_deg", "yaw_deg"), [(20, 0, 40), (0, -15, 40), (-30, 10, 60)]
-)
-def test_it_takes_the_attitude_and_keeps_it(name, roll_deg, pitch_deg, yaw_deg):
-    flight = Flight(name).take_off()
-    roll, pitch, yaw = (math.radians(angle) / 2.0 for angle in (roll_deg, pitch_deg, yaw_deg))
-    q_roll = np.array([math.cos(roll), math.sin(roll), 0.0, 0.0])
-    q_pitch = np.array([math.cos(pitch), 0.0, math.sin(pitch), 0.0])
-    q_yaw = np.array([math.cos(yaw), 0.0, 0.0, math.sin(yaw)])
-    attitude = product(product(q_yaw, q_pitch), q_roll)
-    flight.fly(make_setpoint(thrust=hovering(name), attitude=attitude), 3.0)
-    found = np.degrees(flight.truth.euler_rad)
-    np.testing.assert_allclose(found, (roll_deg, pitch_deg, yaw_deg), atol=2.0)
+@settings(deadline=None)  # the first call may compile
+@given(st.sampled_from(PROFILES.names), accelerations)
+def test_force_keeps_tilt_and_thrust_limits_and_the_height(name, acceleration):
+    gains = GAINS[name]
+    force = specific_force(acceleration, gains)
+    horizontal = math.hypot(force[0], force[1])
+    largest = 4.0 * gains[cascade.G_ROTOR_THRUST] / gains[cascade.G_MASS]
+    assert force[2] < 0.0
+    assert horizontal <= -force[2] * gains[cascade.G_TILT_TANGENT] * (1.0 + 1e-12)
+    assert np.linalg.norm(force) <= 0.9 * largest * (1.0 + 1e-12)
+    wanted = acceleration[2] - gains[cascade.G_GRAVITY]
+    margin = min(math.hypot(acceleration[0], acceleration[1]), 0.2 * gains[cascade.G_GRAVITY])
+    if -math.sqrt((0.9 * largest) ** 2 - margin**2) < wanted < -0.25 * gains[cascade.G_GRAVITY]:
+        assert force[2] == wanted
+    assert force[0] * acceleration[1] == pytest.approx(force[1] * acceleration[0], abs=1e-9)
 
 
-@pytest.mark.parametrize("name", PROFILES.names)
-def test_it_turns_at_the_body_rates(name):
-    flight = Flight(name).take_off()
-    record = flight.fly(make_setpoint(thrust=hovering(name), body_rates=(0.2, -0.1, 0.3)), 0.6)
-    rates = record.rows[-1, T_RATES : T_RATES + 3]
-    np.testing.assert_allclose(rates, (0.2, -0.1, 0.3), atol=0.08)
+@settings(deadline=None)  # the first call may compile
+@given(angles, st.floats(-1.4, 1.4), angles, accelerations)
+def test_rates_turn_the_thrust_towards_the_force(roll, pitch, yaw, acceleration):
+    gains = GAINS["solo"]
+    quaternion = quaternion_from_euler(roll, pitch, yaw)
+    matrix = rotation(measured(quaternion))
+    force = specific_force(acceleration, gains)
+    wanted_down = -force / np.linalg.norm(force)
+    angle = math.acos(min(max(float(matrix[:, 2] @ wanted_down), -1.0), 1.0))
+    assume(1e-3 < angle < 3.1)
+    rates = tilt_rates(force, matrix, gains)
+    assert rates[2] == 0.0
+    size = np.linalg.norm(rates)
+    assert size == pytest.approx(
+        min(gains[cascade.G_TILT_P] * angle, gains[cascade.G_TILT_RATE_LIMIT]), rel=1e-6
+    )
+    # turning by `angle` about that axis brings the body's down axis onto the wanted one
+    axis = matrix @ (rates / size)
+    down = matrix[:, 2]
+    turned = down * math.cos(angle) + np.cross(axis, down) * math.sin(angle)
+    np.testing.assert_allclose(turned, wanted_down, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", PROFILES.names)
-def test_a_velocity_takes_over_without_a_jump(name):
-    flight = Flight(name).take_off()
-    pitched = (math.cos(-0.1), 0.0, math.sin(-0.1), 0.0)
-    flight.fly(make_setpoint(thrust=hovering(name), attitude=pitched), 1.5)
-    record = flight.fly(make_setpoint(velocity=(0.0, 0.0, 0.0)), 5.0)
-    assert np.linalg.norm(record.velocity[-1]) < 0.1
-    assert record.tilt_deg.max() < 45.0
-
-
-def product(p, q):
-    """The Hamilton product of two quaternions (4,) w x y z."""
-    w, v = p[0] * q[0] - p[1:] @ q[1:], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])
-    return np.array([w, *v])
+def test_upside_down_still_turns():
+    matrix = rotation(measured(quaternion_from_euler(math.pi, 0.0, 0.0)))
+    assert np.linalg.norm(tilt_rates(np.array([0.0, 0.0, -9.8]), matrix, GAINS["solo"])) > 1.0
