@@ -101,17 +101,17 @@ def main() -> None:
     print("\n| " + " | ".join(names := ["worlds", "dead nodes", "injector"]) + " | lost | % |")
     print("|---" * 5 + "|")
     places = [[*FACTORS].index(name) for name in names]
-    for levels_ in itertools.product((False, True), repeat=3):
+    for chosen in itertools.product((False, True), repeat=3):
         cells = {
             where: [hit for corner, hits in block.items() for hit in hits
-                    if tuple(corner[place] for place in places) == levels_]
+                    if tuple(corner[place] for place in places) == chosen]
             for where, block in blocks.items()
         }  # fmt: skip
         hits = [hit for cell in cells.values() for hit in cell]
         rates = interval(100.0 * np.array(of_seeds(
             {where: float(np.mean(cell)) for where, cell in cells.items() if cell}
         )))  # fmt: skip
-        ends = [FACTORS[name][level] for name, level in zip(names, levels_, strict=True)]
+        ends = [FACTORS[name][level] for name, level in zip(names, chosen, strict=True)]
         print(f"| {' | '.join(ends)} | {sum(hits)} of {len(hits)} | {text(rates, '')} |")
 
 

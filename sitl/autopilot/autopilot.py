@@ -23,6 +23,7 @@ from sitl.autopilot.flight_modes import begin, climbs
 from sitl.autopilot.parameters import TYPE_REAL32, Parameters
 from sitl.autopilot.telemetry import Link, Links
 from sitl.geodesy import Origin
+from sitl.vehicle.cascade import SP_THRUST
 from sitl.vehicle.truth import Truth
 
 COMPONENT = 1
@@ -157,7 +158,7 @@ class Autopilot(Links):
             self._guidance = begin(commander.mode, now)
             self._flown = commander.mode
         self._guidance(now, out)
-        ready = now.spooled_up or not math.isnan(out[11])  # PX4 does not wait for a thrust
+        ready = now.spooled_up or not math.isnan(out[SP_THRUST])  # PX4 does not wait for a thrust
         flies = not commander.landed or (ready and climbs(out, now.truth))
         now.setpoint, now.motors_on = out, flies and not commander.terminated
         self.flush_texts()

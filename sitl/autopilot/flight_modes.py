@@ -14,6 +14,7 @@ import numpy as np
 from mavfi_cli.core.frames import Vector, dot, norm
 from sitl.autopilot.commander import FlightMode, Setpoint, Severity, Snapshot
 from sitl.autopilot.parameters import Parameters
+from sitl.vehicle.cascade import SP_THRUST
 from sitl.vehicle.truth import Truth
 
 _POSITION_GAIN_PER_S = 0.95  # MPC_XY_P of PX4
@@ -28,7 +29,6 @@ _TAKEOFF_FIRST_MPS = 0.4
 _TAKEOFF_NEAR_M = 0.2
 _ARRIVED_M = 0.5
 _STICK_INVALID = 32767
-_THRUST = 11  # index of the thrust in a setpoint
 _LIFTING = 0.1  # a setpoint with a larger thrust wants to leave the ground
 
 
@@ -43,7 +43,7 @@ def climbs(out: Setpoint, truth: Truth) -> bool:
     So does a thrust. A component that is NaN requests nothing.
     """
     lift = out[2] - truth.position_ned_m[2]
-    return bool(out[5] < -_CLIMB_MPS or lift < -_CLIMB_M or out[_THRUST] > _LIFTING)
+    return bool(out[5] < -_CLIMB_MPS or lift < -_CLIMB_M or out[SP_THRUST] > _LIFTING)
 
 
 def _approach(delta: Vector, *, speed_mps: float, acceleration_mps2: float) -> Vector:
@@ -207,7 +207,7 @@ def _follow_companion(now: Snapshot, out: Setpoint) -> None:
     Along an axis with neither position nor velocity, the vehicle stops.
     """
     values = now.offboard.tolist()
-    if not math.isnan(values[_THRUST]):  # an attitude or body rates, which PX4 does not limit
+    if not math.isnan(values[SP_THRUST]):  # an attitude or body rates, which PX4 does not limit
         out[:] = values
         return
     for axis in range(3):

@@ -23,6 +23,7 @@ from sitl.autopilot.commander import (
 from sitl.autopilot.parameters import HASH_NAME
 from sitl.autopilot.telemetry import BUILDERS, DESCRIPTIONS, Link, int32
 from sitl.geodesy import Origin
+from sitl.vehicle.cascade import SP_ATTITUDE, SP_BODY_RATES, SP_THRUST
 
 _FORCE_MAGIC = 21196
 _INT_UNSET = 0x7FFFFFFF
@@ -274,29 +275,18 @@ _COMMANDS: Mapping[int, _CommandHandler] = {
 # Setpoints, by PX4's rules ------------------------------------------------------------------------
 
 
-def _position_target(autopilot: Autopilot, message: Any, link: Link) -> None:
-    now = autopilot.snapshot
-    heading_rad, home_down_m = now.truth.euler_rad[2], float(now.home_ned_m[2])
-    try:
-        setpoint = setpoint_of(message, heading_rad, now.origin, home_down_m)
-    except ValueError as error:
-        autopilot.commander.queue_text(Severity.CRITICAL, f"{message.get_type()} {error}")
-        return
-    _follow(autopilot, message, link, setpoint)
-
-
-def _attitude_target(autopilot: Autopilot, message: Any, link: Link) -> None:
-    try:
-        setpoint = _attitude_setpoint(message)
-    except ValueError as error:
-        autopilot.commander.queue_text(Severity.CRITICAL, f"{message.get_type()} {error}")
-        return
-    _follow(autopilot, message, link, setpoint)
-
-
-def _follow(autopilot: Autopilot, message: Any, link: Link, setpoint: Setpoint) -> None:
+def _take_setpoint(autopilot: Autopilot, message: Any, link: Link) -> None:
     """Make a setpoint the newest one of the companion, if its sender may give setpoints now."""
     now = autopilot.snapshot
+    try:
+        if message.get_type() == "SET_ATTITUDE_TARGET":
+            setpoint = _attitude_setpoint(message)
+        else:
+            heading_rad, home_down_m = now.truth.euler_rad[2], float(now.home_ned_m[2])
+            setpoint = setpoint_of(message, heading_rad, now.origin, home_down_m)
+    except ValueError as error:
+        autopilot.commander.queue_text(Severity.CRITICAL, f"{message.get_type()} {error}")
+        return
     silence_us = autopilot.parameters.effective("COM_OF_LOSS_T") * 1e6
     if autopilot.authority.follows(message, link, now.stamp_us, silence_us):
         now.offboard = setpoint
@@ -316,18 +306,18 @@ def _attitude_setpoint(message: Any) -> Setpoint:
         raise ValueError("without a collective thrust not supported")
     if not 0.0 <= message.thrust <= 1.0:
         raise ValueError("thrust invalid")
-    out[11] = message.thrust
+    out[SP_THRUST] = message.thrust
     rates = message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate
     if not mask & _IGNORE_ATTITUDE:
         norm = math.sqrt(math.fsum(part * part for part in message.q))
         if not 0.5 < norm < 2.0:
             raise ValueError("quaternion invalid")
-        out[12:16] = message.q
-        _fill(out, 16, rates, mask | _IGNORE_TILT_RATES, _STEEPEST)
+        out[SP_ATTITUDE : SP_ATTITUDE + 4] = message.q
+        _fill(out, SP_BODY_RATES, rates, mask | _IGNORE_TILT_RATES, _STEEPEST)
     elif mask & _IGNORE_TILT_RATES:
         raise ValueError("invalid")
     else:
-        _fill(out, 16, rates, mask, _STEEPEST)
+        _fill(out, SP_BODY_RATES, rates, mask, _STEEPEST)
     return out
 
 
@@ -499,9 +489,9 @@ ADDRESSED: Mapping[int, _Service] = {
     dialect.MAVLINK_MSG_ID_LOG_REQUEST_LIST: lambda _autopilot, _message, link: link.send(
         dialect.MAVLink_log_entry_message(0, 0, 0, 0, 0)  # there are none
     ),
-    dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: _position_target,
-    dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT: _position_target,
-    dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: _attitude_target,
+    dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: _take_setpoint,
+    dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT: _take_setpoint,
+    dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: _take_setpoint,
     dialect.MAVLINK_MSG_ID_COMMAND_LONG: _execute,
     dialect.MAVLINK_MSG_ID_COMMAND_INT: _execute,
 }

@@ -20,6 +20,7 @@ from mavfi_cli.core.config import read_toml
 from mavfi_cli.link.codec import AvailableModes, ComponentMetadata, ProtocolVersion, dialect
 from sitl.autopilot.commander import FlightMode, Snapshot
 from sitl.geodesy import standard_pressure_pa
+from sitl.vehicle.cascade import SP_THRUST
 from sitl.vehicle.profile import GRAVITY_MPS2
 
 TICK_US = 20_000  # period of the control loop
@@ -153,7 +154,7 @@ def _position_target_local_ned(s: Snapshot) -> Any:
     """Return POSITION_TARGET_LOCAL_NED with the active setpoint, as in PX4."""
     unset = np.isnan(s.setpoint)
     mask = sum(bits for start, bits in _ZERO_MASKS if unset[start : start + 3].all())
-    sent = np.where(unset, 0.0, s.setpoint).tolist()[:11]
+    sent = np.where(unset, 0.0, s.setpoint).tolist()[:SP_THRUST]
     if unset[9]:
         sent[9] = s.truth.euler_rad[2]
     return dialect.MAVLink_position_target_local_ned_message(
