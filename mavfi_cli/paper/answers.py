@@ -30,13 +30,16 @@ _KINDS = {  # kinds of faults: level, and effect on the struck node
 }
 
 
-def judgement_of(judged: JudgedClaim, stack: str, fate: Fate = Fate.ALL) -> Judgement | None:
-    """Return the judgement of a claim for a stack, or for isolated kernels if it is about those.
+def judgement_of(judged: JudgedClaim, place: str, fate: Fate = Fate.ALL) -> Judgement | None:
+    """Return the judgement of a claim at a place, or in isolated kernels if it is about those.
 
     Return None if the claim was not judged there for faults of this fate.
+
+    Args:
+        place: a stack, or a name from `place_of`.
     """
-    place = ISOLATED if judged.claim.isolated else stack
-    return judged.judgements.get(place, {}).get(fate)
+    where = ISOLATED if judged.claim.isolated else place
+    return judged.judgements.get(where, {}).get(fate)
 
 
 _SHORT = {
@@ -77,9 +80,9 @@ class Family:
 # Does it reproduce the paper? ---------------------------------------------------------------------
 
 
-def answer(claims: Sequence[JudgedClaim], stack: str) -> str:
-    """Return a sentence on how far a stack and the isolated kernels reproduce the paper."""
-    counts = _count_verdicts(claims, stack)
+def answer(claims: Sequence[JudgedClaim], place: str) -> str:
+    """Return a sentence on how far a place and the isolated kernels reproduce the paper."""
+    counts = _count_verdicts(claims, place)
     yes, no, open_ = (
         counts[verdict] for verdict in (Verdict.REPRODUCED, Verdict.CONTRADICTED, Verdict.UNDECIDED)
     )
@@ -96,7 +99,7 @@ def answer(claims: Sequence[JudgedClaim], stack: str) -> str:
     )
 
 
-def crash_sentence(claims: Sequence[JudgedClaim], stack: str, flights: Flights) -> str:
+def crash_sentence(claims: Sequence[JudgedClaim], place: str, flights: Flights) -> str:
     """Return sentences on how reproduced claims and lost missions depend on dead nodes.
 
     The first counts the reproduced claims that silent faults alone reproduce too, the second the
@@ -106,8 +109,8 @@ def crash_sentence(claims: Sequence[JudgedClaim], stack: str, flights: Flights) 
     pairs = [
         (of_all, silent)
         for judged in claims
-        if (of_all := judgement_of(judged, stack))
-        and (silent := judgement_of(judged, stack, Fate.SILENT))
+        if (of_all := judgement_of(judged, place))
+        and (silent := judgement_of(judged, place, Fate.SILENT))
     ]
     yes = [silent.verdict for of_all, silent in pairs if of_all.verdict is Verdict.REPRODUCED]
     if yes:
@@ -126,9 +129,9 @@ def crash_sentence(claims: Sequence[JudgedClaim], stack: str, flights: Flights) 
     return " ".join(parts)
 
 
-def _count_verdicts(claims: Sequence[JudgedClaim], stack: str) -> Counter[Verdict]:
-    """Count the claims with each verdict, on a stack or in isolated kernels."""
-    judgements = (judgement_of(judged, stack) for judged in claims)
+def _count_verdicts(claims: Sequence[JudgedClaim], place: str) -> Counter[Verdict]:
+    """Count the claims with each verdict, at a place or in isolated kernels."""
+    judgements = (judgement_of(judged, place) for judged in claims)
     return Counter(judgement.verdict for judgement in judgements if judgement)
 
 
@@ -161,30 +164,30 @@ class Disagreement:
         return names
 
 
-def disagreements(claims: Sequence[JudgedClaim], stack: str) -> list[Disagreement]:
-    """Group the claims that are contradicted on a stack by reason, in the order of the claims."""
+def disagreements(claims: Sequence[JudgedClaim], place: str) -> list[Disagreement]:
+    """Group the claims that are contradicted at a place by reason, in the order of the claims."""
     by_reason: dict[str, list[JudgedClaim]] = {}
     for judged in claims:
-        judgement = judgement_of(judged, stack)
+        judgement = judgement_of(judged, place)
         if judgement and judgement.verdict is Verdict.CONTRADICTED:
-            reason = reason_of(judged, stack)
+            reason = reason_of(judged, place)
             by_reason.setdefault(reason or judged.claim.name, []).append(judged)
     return [
-        Disagreement(claims=mine, reason=reason_of(mine[0], stack)) for mine in by_reason.values()
+        Disagreement(claims=mine, reason=reason_of(mine[0], place)) for mine in by_reason.values()
     ]
 
 
-def reason_of(judged: JudgedClaim, stack: str) -> str:
-    """Return the known reason why a claim is contradicted on a stack, or an empty string.
+def reason_of(judged: JudgedClaim, place: str) -> str:
+    """Return the known reason why a claim is contradicted at a place, or an empty string.
 
     A reason explains one effect, on the paper's stack or in isolated kernels. It is returned only
     if the claim is contradicted and its effect lies in the interval that the reason explains.
     """
     words, low, high = REASONS.get(judged.claim.name, ("", 0.0, 0.0))
-    judgement = judgement_of(judged, stack)
+    judgement = judgement_of(judged, place)
     if not judgement or judgement.verdict is not Verdict.CONTRADICTED or judgement.effect is None:
         return ""
-    explained = judged.claim.isolated or stack_of(stack) == STACKS[0]
+    explained = judged.claim.isolated or stack_of(place) == STACKS[0]
     return words if explained and low <= judgement.effect.value <= high else ""
 
 
