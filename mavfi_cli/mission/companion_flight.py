@@ -163,7 +163,7 @@ class CompanionFlight:
     def _turn(self) -> None:
         """Forward frames for a moment, then check programs, fault and outcome."""
         self._router.turn(_TURN_S, time.monotonic() + _SERVE_S)
-        if self.telemetry.ready or self.stamp_s > _BOOT_S:
+        if self._crew.running or self.telemetry.ready or self.stamp_s > _BOOT_S:
             self._crew.manage(self.stamp_s, self.telemetry.state)
         self._strike()
         self._judge()

@@ -13,6 +13,7 @@ link = mavutil.mavlink_connection(sys.argv[1], source_system=1, source_component
 speed, end = float(sys.argv[2]), sys.argv[3]
 mav, common = link.mav, mavutil.mavlink
 VELOCITY = 0b1001_1100_0111  # ignores positions, accelerations and the yaw rate
+PREARM = common.MAV_SYS_STATUS_PREARM_CHECK
 now_s, armed, offboard = 0.0, False, False
 
 
@@ -57,4 +58,6 @@ if end == "crashes":
 while True:
     mav.command_long_send(1, 1, common.MAV_CMD_NAV_LAND, 0, *[0] * 7)
     mav.heartbeat_send(18, 8, 0, 0, 0)
-    link.recv_match(type="HEARTBEAT", blocking=True, timeout=0.2)
+    heard = link.recv_match(type="SYS_STATUS", blocking=True, timeout=0.2)
+    if end == "leaves" and heard and not heard.onboard_control_sensors_health & PREARM:
+        break

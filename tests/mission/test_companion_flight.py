@@ -88,6 +88,13 @@ def test_every_end_is_a_result(fly, end, options, outcome, reason):
 
 
 @pytest.mark.slow
+def test_the_end_of_a_program_is_seen_while_the_vehicle_lands(fly):
+    run = fly("leaves", success='exit = "hop"')
+    assert (run.record.outcome, run.record.reason) == ("success", "hop ended with code 0")
+    assert run.trace["z_m"].to_numpy()[-1] > 1.0
+
+
+@pytest.mark.slow
 def test_a_corridor_around_the_golden_path(fly):
     golden = fly("lands")
     near = f"landed = true\ncorridor_m = 3.0\ngolden = '{golden.folder.path}'"
