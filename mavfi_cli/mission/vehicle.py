@@ -218,8 +218,10 @@ class VehicleProcess(Vehicle):
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         line = [*PYTHON, "-m", *self._line(config, theirs.fileno())]
         self.depth = self._scratch.path / "depth"
-        if config.companion is not None and CompanionConfig.load(config.companion).uses("depth"):
-            line += ["--depth", str(self.depth)]
+        if config.companion is not None:
+            companion = CompanionConfig.load(config.companion)
+            line += ["--depth", str(self.depth)] if companion.uses("depth") else []
+            line += [] if companion.camera_heartbeat else ["--camera-heartbeat", "0"]
         with theirs:
             try:
                 self._process = subprocess.Popen(

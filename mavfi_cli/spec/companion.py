@@ -179,6 +179,8 @@ class CompanionConfig:
         name: Name of the companion, which detector models that are fitted to it store.
         own_network: In a campaign, each mission has a network of its own with only a loopback, if
             the operating system allows it, so that fixed ports do not collide.
+        camera_heartbeat: The camera component sends heartbeats. MAVProxy and DroneKit mistake them
+            for those of a second vehicle.
     """
 
     program: dict[str, ProgramConfig]
@@ -192,6 +194,7 @@ class CompanionConfig:
     gate: GateConfig = field(default_factory=GateConfig)
     name: str = "companion"
     own_network: bool = True
+    camera_heartbeat: bool = True
 
     def __post_init__(self) -> None:
         if not self.program:

@@ -1,4 +1,4 @@
-"""MAVProxy, unchanged, against `python -m sitl` over TCP, driven through its own prompt."""
+"""MAVProxy, unchanged, against `python -m sitl` over TCP and as a companion, through its prompt."""
 
 import contextlib
 import importlib.util
@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 from pages import block
+
+from mavfi_cli import library
 
 _MODULES = "param,arm,mode,cmdlong,misc"
 
@@ -186,3 +188,15 @@ def test_mavproxy_loads_its_modules_and_fetches_parameters_again(sitl, connect, 
     proxy.expect(r"Received \d+ parameters")
     assert shown(proxy, "MPC_XY_VEL_MAX") == 4.0
     server.stop()
+
+
+@pytest.mark.slow
+def test_mavproxy_flies_as_a_companion(tmp_path):
+    script = Path(__file__).with_name("mavproxy_flight.py")
+    companion = tmp_path / "mavproxy.toml"
+    companion.write_text(
+        f"camera_heartbeat = false\n[program.fly]\ncommand = '{sys.executable} {script} {{link}}'\n"
+    )
+    run = library.fly(companion=str(companion), world="farm", time_limit_s=60.0, out=tmp_path)
+    assert (run.record.outcome, run.record.reason) == ("success", "fly ended with code 0")
+    assert run.record.quality_of_flight.distance_m > 14.0

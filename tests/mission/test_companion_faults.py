@@ -193,7 +193,8 @@ def test_a_struck_flight_has_a_record_of_its_fault(tmp_path, fault, outcome, lin
 
 
 @pytest.mark.slow
-def test_an_instruction_of_a_program_is_struck_in_flight_and_struck_again(tmp_path, mavfi):
+@pytest.mark.parametrize("process", ["hop", "hop/hop.py"])
+def test_an_instruction_of_a_program_is_struck_in_flight_and_struck_again(tmp_path, mavfi, process):
     companion = tmp_path / "hop.toml"
     companion.write_text(
         f"[program.hop]\ncommand = '{sys.executable} {HOP} {{link}} 2 lands'\n"
@@ -201,7 +202,7 @@ def test_an_instruction_of_a_program_is_struck_in_flight_and_struck_again(tmp_pa
     )
     line = ["fly", "--companion", companion, "--world", "farm", "--speed", 2, "--time-limit", 60]
     line += ["--no-picture", "--quiet", "--json", "--out", tmp_path]
-    drawn = ["--level", "instruction", "--inject", "hop", "--at", "time=4"]
+    drawn = ["--level", "instruction", "--inject", process, "--at", "time=4"]
     faults = []
     for fault in ([*drawn, "--fault-seed", 5], ["--replay", tmp_path / "farm-3-001"]):
         done = mavfi(*line, *fault)

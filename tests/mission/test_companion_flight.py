@@ -31,10 +31,10 @@ SPEED = 4.0
 def fly(tmp_path):
     """A function that flies the hop in an empty scene; arguments are keys of the companion."""
 
-    def flown(end, *, success="landed = true", program="", limit_s=60.0, **settings):
+    def flown(end, *, success="landed = true", program="", top="", limit_s=60.0, **settings):
         companion = tmp_path / "hop.toml"
         companion.write_text(
-            f"[program.hop]\ncommand = '{sys.executable} {HOP} {{link}} {SPEED} {end}'\n"
+            f"{top}\n[program.hop]\ncommand = '{sys.executable} {HOP} {{link}} {SPEED} {end}'\n"
             f"{program}\n[success]\n{success}\n"
         )
         return library.fly(
@@ -60,14 +60,23 @@ def test_a_flight_leaves_a_record_as_any_other(fly):
     commanded = columns["command_vy"][columns["phase"] == "OFFBOARD"]
     assert {0.0, 2.0} <= set(np.round(commanded[~np.isnan(commanded)], 6))
     assert np.nanmax(np.abs(columns["x_m"] - columns["truth_x_m"])) < 0.2
-    data = run.folder.tlog.read_bytes()
-    kinds = {m.get_type() for m in Codec(0, 0).decode(data)}
+    messages = Codec(0, 0).decode(run.folder.tlog.read_bytes())
+    kinds = {m.get_type() for m in messages}
     assert {"HEARTBEAT", "LOCAL_POSITION_NED", "SET_POSITION_TARGET_LOCAL_NED"} <= kinds
     assert any("Program     hop: started 1x" in line for line in summary_lines(run.record))
     draw_top_view(run)
     assert ViewedFlight(name="flight", run=run, recorder=None).run is run
     with pytest.raises(RecordError, match="is not repeatable"):
         fly_again(run, run.folder.path.parent)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("beats", [True, False])
+def test_the_heartbeat_of_the_camera(fly, beats):
+    run = fly("waits", limit_s=3.0, top=f"camera_heartbeat = {str(beats).lower()}")
+    messages = Codec(0, 0).decode(run.folder.tlog.read_bytes())
+    hearts = {m.get_srcComponent() for m in messages if m.get_type() == "HEARTBEAT"}
+    assert hearts == ({1, 100} if beats else {1})
 
 
 @pytest.mark.slow

@@ -174,13 +174,17 @@ def _process_of(leader: int | None, executable: str | None) -> int | None:
 
     Args:
         leader: Id of the program's own process, which leads the session; None if it is not running.
-        executable: File name of the executable. If None, the leader itself is returned.
+        executable: File name of the executable, or of the script that an interpreter runs. If None,
+            the leader itself is returned.
     """
     if leader is None or executable is None:
         return leader
     for pid in sorted(int(name) for name in os.listdir("/proc") if name.isdigit()):
         with contextlib.suppress(OSError):  # it has ended, or is another user's
-            own = os.getsid(pid) == leader
-            if own and Path(os.readlink(f"/proc/{pid}/exe")).name == executable:
+            if os.getsid(pid) != leader:
+                continue
+            words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[:2]  # the script's too
+            files = [os.readlink(f"/proc/{pid}/exe"), *map(os.fsdecode, words)]
+            if executable in [Path(file).name for file in files]:
                 return pid
     return None

@@ -1,0 +1,73 @@
+r"""Counts the flights of a user's companion that faults lose, with and without the gate.
+
+    python benchmarks/companion_gate.py docs/results/mavsdk-gate.parquet
+
+Reads exports of campaigns (`mavfi campaign export`) with golden flights, null faults and faults in
+instructions. A fault struck if the record has its activation. It is dead if its process ended, and
+silent otherwise. A flight is lost if it does not end in success. Intervals are Wilson's, 95 %; p is
+that of Fisher's exact test.
+"""
+
+from __future__ import annotations
+
+from exported import Row, arguments, flown, lost, share
+
+from mavfi_cli.stats.shares import wilson
+
+
+def main() -> None:
+    """Read the exports, and print the fault-free flights and the faults, each as a table."""
+    rows = flown(arguments(__doc__).parse_args().parts)
+    null = [row for row in rows if row.get("label_null")]
+    golden = [row for row in rows if row["injected"] == "golden"]
+    plain, gated = ([row for row in golden if bool(row["detector"]) is on] for on in (False, True))
+    print("| | succeeded | alarms |\n|---|---|---|")
+    for name, part in (("golden", plain), ("golden, with the gate", gated), ("null faults", null)):
+        alarms = _alarms(part) if part is gated else ""
+        print(f"| {name} | {share(len(part) - sum(map(lost, part)), len(part))} | {alarms} |")
+
+    drawn = [row for row in rows if row["level"] == "instruction" and not row.get("label_null")]
+    sides = [[row for row in drawn if bool(row["detector"]) is on] for on in (False, True)]
+    struck = [[row for row in side if row["activation"]] for side in sides]
+    print("\n| | without the gate | with the gate | p (Fisher) |\n|---|---|---|---|")
+    print(f"| drawn faults | {len(sides[0])} | {len(sides[1])} | |")
+    _compare("faults that struck", [[*map(bool, side)] for side in struck], counts=True)
+    _compare("lost", [[*map(lost, side)] for side in struck])
+    _compare("dead", [[*map(_dead, side)] for side in struck], counts=True)
+    for name, kind in (("dead", _dead), ("silent", _silent)):
+        _compare(f"lost, of the {name}", [[*map(lost, filter(kind, side))] for side in struck])
+    overwritten = [[row["activation"] == "overwritten" for row in side] for side in struck]
+    _compare("overwritten", overwritten, counts=True)
+    alarmed = [row for row in struck[1] if row["alarm_count"]]
+    print(f"\nAlarms in {len(alarmed)} of {len(struck[1])} struck flights with the gate, ", end="")
+    print(f"of which {sum(map(lost, alarmed))} were lost.")
+
+
+def _dead(row: Row) -> bool:
+    return bool(row["node_ended"])
+
+
+def _silent(row: Row) -> bool:
+    return not row["node_ended"]
+
+
+def _alarms(rows: list[Row]) -> str:
+    """Return the number of flights with an alarm, and the time flown, as text."""
+    hours = sum(row["flight_time_s"] or 0.0 for row in rows) / 3600.0
+    return f"in {sum(bool(row['alarm_count']) for row in rows)} flights, {hours:.2f} h"
+
+
+def _compare(name: str, sides: list[list[bool]], *, counts: bool = False) -> None:
+    """Print a row with the counts of both sides, or their shares and the test of these."""
+    hits, totals = [sum(side) for side in sides], [len(side) for side in sides]
+    if counts:
+        print(f"| {name} | {hits[0]} | {hits[1]} | |")
+        return
+    pairs = [*zip(hits, totals, strict=True)]
+    cells = " | ".join(share(*pair) for pair in pairs)
+    without, gated = (wilson(*pair) for pair in pairs)
+    print(f"| {name} | {cells} | {without.fisher(gated):.2g} |")
+
+
+if __name__ == "__main__":
+    main()
