@@ -64,6 +64,8 @@ ONE_THREAD = {
 }
 """Environment of a process that forks itself, so that its libraries start no threads."""
 
+_USERS = "MAVFI_USERS_ENVIRONMENT"  # the user's own values of these variables, as JSON
+
 _prctl = ctypes.CDLL(None, use_errno=True).prctl
 PACKET = 1 << 17  # largest request or report, bytes
 ERRORS, SCRATCH = "stderr.txt", "tmp"
@@ -152,7 +154,7 @@ class ForkServer:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
-                env={**os.environ, **ONE_THREAD},
+                env=_forking_environment(),
                 start_new_session=True,  # Ctrl-C is for the client
             )
         answer = b""
@@ -409,6 +411,25 @@ class Forks:
         self._channel.send(json.dumps(message).encode())
 
 
+def _forking_environment() -> dict[str, str]:
+    """Return the environment of a server process, which remembers what it changes."""
+    users = {name: os.environ.get(name) for name in ONE_THREAD}
+    return {_USERS: json.dumps(users), **os.environ, **ONE_THREAD}
+
+
+def users_environment() -> dict[str, str]:
+    """Return the environment in which the user has started mavfi, for programs of the user.
+
+    TMPDIR remains this process's own folder, which mavfi removes.
+    """
+    environment = {**os.environ}
+    for name, value in json.loads(environment.pop(_USERS, "{}")).items():
+        environment.pop(name, None)
+        if value is not None:
+            environment[name] = value
+    return environment
+
+
 def _begin(folder: Path, parent: int) -> None:
     """Give a new worker or fork its own session and streams, and have it die with its parent."""
     os.setsid()
@@ -464,14 +485,21 @@ def _end_children(others: Sequence[int] = ()) -> None:
     """Kill and reap every descendant of this process, except its children in `others`.
 
     This process inherits the children of a killed child, so the loop repeats until none are left.
+    A child that has become another user's, for example by sudo, cannot be killed.
     """
-    while children := [pid for pid in _children() if pid not in others]:
+    left = set(others)
+    while children := [pid for pid in _children() if pid not in left]:
         for pid in children:
-            with contextlib.suppress(ProcessLookupError):
+            try:
                 os.kill(pid, signal.SIGKILL)
+            except ProcessLookupError:
+                pass
+            except PermissionError:  # it has become another user's
+                left.add(pid)
         for pid in children:
-            with contextlib.suppress(ChildProcessError):
-                os.waitpid(pid, 0)
+            if pid not in left:
+                with contextlib.suppress(ChildProcessError):
+                    os.waitpid(pid, 0)
 
 
 def _children() -> list[int]:

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
 import signal
-import threading
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -21,12 +18,11 @@ from mavfi_cli.fi.injector import Injector, Listener, Moment, Pattern, change_of
 from mavfi_cli.link.codec import Message, Signing, renewed
 from mavfi_cli.link.fields import is_ignored
 from mavfi_cli.link.router import Side
-from mavfi_cli.mission.programs import RunningProgram
+from mavfi_cli.mission.programs import RunningProgram, Throttle
 from mavfi_cli.spec.fault import PROCESS, FaultConfig
 
 _SIDES = {None: None, "output": Side.COMPANION, "input": Side.AUTOPILOT}
 _RECEIVERS = {Side.COMPANION: "autopilot", Side.AUTOPILOT: "companion"}
-_PERIOD_S = 0.02  # cycle of running and stopping a slowed program
 
 
 class LinkInjector(Injector):
@@ -62,7 +58,7 @@ class LinkInjector(Injector):
         self.units = {state.name: state.unit for state in self._states} or {fields.name: ""}
         self.side: Side | None = None
         self._count = 0
-        self._swapped: list[Message] = []
+        self._swapped: dict[Side, Message] = {}
         self._late: list[tuple[float, Message, Side]] = []
         self._locked = False  # a struck frame was signed with an unknown key
 
@@ -76,14 +72,14 @@ class LinkInjector(Injector):
     def pass_between(self, message: Message, side: Side, moment: Moment) -> list[Message]:
         """Return the messages to pass on in place of `message`.
 
-        Unless the fault strikes, they are the message itself. A swapped message follows the next.
+        Unless the fault strikes, they are the message itself. A swapped message follows the next
+        one of the same side.
         """
         if message.get_msgId() != self._number or self._only not in (None, side):
             return [message]
         self._count += 1
-        if self._swapped:
-            swapped, self._swapped = self._swapped, []
-            return [message, *swapped]
+        if side in self._swapped:
+            return [message, self._swapped.pop(side)]
         if not self._due(moment, self._count):
             return [message]
         if self._states:
@@ -92,7 +88,7 @@ class LinkInjector(Injector):
         self._record(moment, self._count, ())
         effect = self._corruption.effect
         if effect is Effect.SWAP:
-            self._swapped = [message]
+            self._swapped[side] = message
         elif effect is Effect.LATE:
             self._late.append((moment.stamp_s + self._corruption.amount, message, side))
         return [message, message] if effect is Effect.TWICE else []
@@ -127,37 +123,28 @@ class LinkInjector(Injector):
         self.follower.read(message, _RECEIVERS[side], stamp_s, read)
 
 
-class Throttle(threading.Thread):
-    """Slows a program down: lets it run for a share of every 20 ms, and stops it for the rest.
+class _ProgramKiller(Killer):
+    """Decides when a fault strikes a program. A program that does not run then is not struck.
 
-    The signals go to the program's process group. With a share of 0 the program is stopped until
-    `end`.
+    Args:
+        runs: Returns True if the program is running.
     """
 
-    def __init__(self, program: RunningProgram, share: float) -> None:
-        super().__init__(daemon=True)
-        self._program, self._share = program, share
-        self._over = threading.Event()
-        self.start()
+    def __init__(self, *args: Any, runs: Callable[[], bool]) -> None:
+        super().__init__(*args)
+        self._runs, self._gone = runs, False
 
-    def run(self) -> None:
-        """Alternately stop and resume the program until `end`."""
-        stopped_s = (1.0 - self._share) * _PERIOD_S if self._share else None
-        while not self._over.wait(self._share * _PERIOD_S):
-            self._signal(signal.SIGSTOP)
-            self._over.wait(stopped_s)
-            self._signal(signal.SIGCONT)
+    @property
+    def missed(self) -> str:
+        """The reason why the fault never struck, as text for the record."""
+        return "the program was not running" if self._gone else super().missed
 
-    def _signal(self, number: int) -> None:
-        pid = self._program.pid
-        if pid is not None:
-            with suppress(ProcessLookupError):
-                os.killpg(pid, number)
-
-    def end(self) -> None:
-        """Stop throttling, so that the program runs freely."""
-        self._over.set()
-        self.join()
+    def strike(self, moment: Moment) -> None:
+        """Report the strike to the listener if the fault is due and the program runs."""
+        if not self._gone and self._due(moment):
+            self._gone = not self._runs()
+            if not self._gone:
+                self._record(moment, moment.tick, ())
 
 
 class CompanionFault(NoInjection):
@@ -198,6 +185,7 @@ class CompanionInjection(CompanionFault, SourceInjection):
         super().__init__(config)
         self._signing = signing
         self._throttle: Throttle | None = None
+        self._usual_share: float | None = None  # of a program that its own file slows down
         self._until_s = math.inf
         check_companion_fault(config, programs)
 
@@ -205,7 +193,9 @@ class CompanionInjection(CompanionFault, SourceInjection):
         """Draw the fault, as described in `CompanionFault.aim_at`."""
         config = self._config
         if config.killed_node is not None:
-            self.injector = Killer(config, shortest_flight_s, self._on_strike)
+            self.injector = _ProgramKiller(
+                config, shortest_flight_s, self._on_strike, runs=self._target_runs
+            )
             self._reader = config.killed_node
             self._stage, self._units = PROCESS, {config.target: ""}
             return
@@ -220,14 +210,23 @@ class CompanionInjection(CompanionFault, SourceInjection):
     def tick(self, moment: Moment) -> None:
         """Strike a process if the fault is due, and end a slowdown when its time is up."""
         self.injector.strike(moment)
-        if self._throttle is not None and moment.stamp_s >= self._until_s:
-            self._throttle.end()
-            self._throttle = None
+        if moment.stamp_s >= self._until_s:
+            self.close()
 
     def close(self) -> None:
         """End a slowdown that still lasts, so that the stopped program can end."""
-        if self._throttle is not None:
+        if self._throttle is not None and self._usual_share is not None:
+            self._throttle.share = self._usual_share
+        elif self._throttle is not None:
             self._throttle.end()
+        self._throttle = None
+
+    @property
+    def _target(self) -> RunningProgram | None:
+        return self.running.get(self._config.killed_node or "")
+
+    def _target_runs(self) -> bool:
+        return self._target is not None and self._target.poll() and self._target.pid is not None
 
     def _on_strike(self, strike: Strike) -> None:
         """Record the first strike before it takes effect, then kill or slow a targeted process."""
@@ -239,14 +238,16 @@ class CompanionInjection(CompanionFault, SourceInjection):
             if not strike.changes and self.link.side is not None:
                 self._reader = _RECEIVERS[self.link.side]
             return
-        program = self.running.get(self._config.killed_node or "")
-        if program is None:
-            return
-        corruption = self._config.corruption()
+        program, corruption = self._target, self._config.corruption()
+        assert program is not None
         if corruption.effect is Effect.FLIP:
             program.signal(signal.SIGKILL)
             return
-        self._throttle = Throttle(program, corruption.amount)
+        if program.throttle is None:
+            self._throttle = Throttle(program, corruption.amount)
+        else:
+            self._throttle, self._usual_share = program.throttle, program.throttle.share
+            self._throttle.share = corruption.amount * self._usual_share
         self._until_s = strike.stamp_s + corruption.duration_s
 
 

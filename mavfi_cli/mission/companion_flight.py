@@ -40,7 +40,7 @@ from mavfi_cli.mission.companion_faults import CompanionFault
 from mavfi_cli.mission.crew import Crew
 from mavfi_cli.mission.programs import Programs
 from mavfi_cli.mission.progress import FlightLogger, FlightProgress, Watcher
-from mavfi_cli.mission.run_folder import RunFolder, Trace
+from mavfi_cli.mission.run_folder import RunFolder, Trace, load_run
 from mavfi_cli.mission.setpoint_gate import SetpointGate
 from mavfi_cli.mission.setpoints import command_of
 from mavfi_cli.spec.companion import CompanionConfig, SuccessConfig
@@ -48,6 +48,7 @@ from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
 
 _TURN_S = 0.02
 _SERVE_S = 0.02  # longest time to serve the links in a turn
+_HEARTBEATS_S = 2.0  # time in which a heartbeat reports that the vehicle is armed
 _BOOT_S = 60.0  # simulated time after which programs start even if the vehicle cannot arm yet
 _SILENCE_S = 60.0  # wall-clock time without a message after which the vehicle counts as lost
 _REST_MPS, _REST_S = 0.5, 1.0  # largest speed at rest, and how long it must last
@@ -98,9 +99,12 @@ class CompanionFlight:
         self._commanders: set[tuple[int, int]] = set()
         self._ticks = 0  # since the first arming
         self._mode, self._failsafe = "", False
+        self._saved = False  # a failsafe was in command when the vehicle was last in the air
+        self._over_s = math.inf  # stamp at which every program had ended
         self._next_progress_s = 0.0
         self._crew = Crew(companion, self.logger.note)
         self._verdict = _Verdict(companion.success, self._crew)
+        self._golden_s = _flight_s_of(companion.success.golden)
         self._time_limit_s = min(config.time_limit_s, companion.time_limit_s or math.inf)
         self._goal_enu_m: FloatArray | None = None
 
@@ -119,7 +123,13 @@ class CompanionFlight:
         return SetpointGate(
             detector, self._companion.gate, self._companion.mark, note=note,
             signing=signing_from_file(self._companion.key_file), gone=lambda: self._crew.ended(),
+            speed=self._speed,
         )  # fmt: skip
+
+    @property
+    def _speed(self) -> float:
+        """Simulated seconds per second of the wall clock; infinite if they are unrelated."""
+        return self._config.speed
 
     @property
     def detection(self) -> dict[str, Any] | None:
@@ -176,7 +186,7 @@ class CompanionFlight:
     def _shortest_flight_s(self, briefing: Briefing) -> float:
         """Return the length in seconds of the interval from which a random fault time is drawn."""
         way_m = norm(briefing.goal_enu_m - briefing.start_enu_m)
-        return self._companion.flight_s or way_m / self._config.v_max_mps
+        return self._companion.flight_s or self._golden_s or way_m / self._config.v_max_mps
 
     def _placeholders(
         self, folder: RunFolder, briefing: Briefing, depth: Path | None
@@ -287,6 +297,8 @@ class CompanionFlight:
                 self.stamp_s, "autopilot", "a failsafe has taken over", telemetry.state
             )
         self._failsafe = failsafe
+        if telemetry.in_air:
+            self._saved = failsafe
 
     def _tick(self, state: VehicleState) -> None:
         """Record a new state, and report progress once per simulated second."""
@@ -307,7 +319,7 @@ class CompanionFlight:
     def _watch(self, message: Message) -> None:
         """Handle a message from the companion's side."""
         if isinstance(message, dialect.MAVLink_heartbeat_message):
-            self._crew.heartbeat = True
+            self._crew.hear(message.get_srcSystem(), message.get_srcComponent())
         if message.get_msgId() != _SETPOINT:
             return
         sender = message.get_srcSystem(), message.get_srcComponent()
@@ -330,7 +342,7 @@ class CompanionFlight:
         on_ground = telemetry.landed_state == dialect.MAV_LANDED_STATE_ON_GROUND
         flew = self._verdict.flew = self._verdict.flew or telemetry.in_air
         down = flew and on_ground and not telemetry.armed
-        self._verdict.landed = down
+        self._verdict.landed = down and not self._saved
         failure = self._crew.failure()
         if telemetry.collision_text is not None:
             self._end(Outcome.COLLISION, telemetry.collision_text.removeprefix("Collision: "))
@@ -344,9 +356,9 @@ class CompanionFlight:
                 self._end(Outcome.SUCCESS, self._verdict.describe())
         elif self._crew.unready:
             self._end(Outcome.CRASH, self._crew.unready)
-        elif self._crew.over and (
-            down or self._failsafe or not telemetry.armed
-        ):  # nothing further can happen
+        elif down and self._saved and self._companion.success.landed:
+            self._end(Outcome.FAILSAFE, "a failsafe of the autopilot landed the vehicle")
+        elif self._is_alone() and (down or self._failsafe or not telemetry.armed):
             if failure:
                 self._end(Outcome.CRASH, failure)
             elif self._failsafe:
@@ -359,10 +371,22 @@ class CompanionFlight:
         elif time.monotonic() - self._heard_s > _SILENCE_S:
             self._end(Outcome.LINK_LOST, f"the vehicle said nothing for {_SILENCE_S:g} s")
 
+    def _is_alone(self) -> bool:
+        """Return True if all programs have ended, and a heartbeat has told their last effect."""
+        if not self._crew.over:
+            return False
+        self._over_s = min(self._over_s, self.stamp_s)
+        return self.stamp_s - self._over_s > _HEARTBEATS_S
+
     def _end(self, outcome: Outcome, reason: str = "") -> None:
         self.outcome, self.reason, self.end_s = outcome, reason, self.stamp_s
         text = outcome.value.replace("_", " ") + (f": {reason}" if reason else "")
         self.logger.note(self.stamp_s, "outcome", text, self.telemetry.state)
+
+
+def _flight_s_of(golden: str | None) -> float | None:
+    """Return the flight time of a golden flight, in seconds. Return None if it has none."""
+    return None if golden is None else load_run(golden).record.quality_of_flight.flight_time_s
 
 
 def _free_port() -> int:
@@ -388,6 +412,10 @@ class LockstepFlight(CompanionFlight):
         self._require_lockstep()
         self._end_of_link = open_transport(url)
         return self._end_of_link
+
+    @property
+    def _speed(self) -> float:
+        return math.inf
 
     def _require_lockstep(self) -> None:
         config, fault = self._config, self._config.fault
@@ -507,7 +535,8 @@ class _Verdict:
 
     Raises:
         RecordError: The golden flight that defines the corridor cannot be read.
-        ConfigError: The trace of the golden flight has fewer than two positions.
+        ConfigError: The trace of the golden flight has fewer than two positions, or one that is not
+            finite.
     """
 
     def __init__(self, success: SuccessConfig, crew: Crew) -> None:
@@ -573,7 +602,7 @@ def path_of(folder: Path) -> FloatArray:
 
     Raises:
         RecordError: The trace cannot be read.
-        ConfigError: The trace has fewer than two positions.
+        ConfigError: The trace has fewer than two positions, or one that is not finite.
     """
     trace = read_parquet(RunFolder(folder).trace, "golden trace")
     try:
@@ -582,6 +611,10 @@ def path_of(folder: Path) -> FloatArray:
         path = np.zeros((0, 3))
     if len(path) < 2:
         raise ConfigError("the golden trace has fewer than two positions", key="success.golden")
+    if not np.isfinite(path).all():
+        raise ConfigError(
+            "the golden trace has a position that is not finite", key="success.golden"
+        )
     return path
 
 

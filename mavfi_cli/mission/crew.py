@@ -13,8 +13,7 @@ from typing import Any
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.flight_record import ProgramEnds
 from mavfi_cli.core.types import VehicleState
-from mavfi_cli.mission.companion_faults import Throttle
-from mavfi_cli.mission.programs import Programs, RunningProgram
+from mavfi_cli.mission.programs import Programs, RunningProgram, Throttle
 from mavfi_cli.spec.companion import CompanionConfig, ProgramConfig
 
 _PORT_LOOK_S = 0.1
@@ -29,7 +28,6 @@ class Crew:
     Attributes:
         begun_s: Stamp of the start of the first program; infinite before.
         running: Started programs by name.
-        heartbeat: True once a MAVLink heartbeat has arrived from the companion.
         connected: True once the program in lockstep has connected; always true without lockstep.
         unready: Why the companion cannot become ready; empty if it is or still may.
     """
@@ -39,11 +37,12 @@ class Crew:
         self._waiting: list[tuple[str, ProgramConfig]] = list(companion.program.items())
         self.begun_s = math.inf
         self.running: dict[str, RunningProgram] = {}
-        self.heartbeat, self.connected = False, not companion.in_lockstep
+        self.connected = not companion.in_lockstep
+        self._senders: set[tuple[int, int]] = set()  # of heartbeats: system, component
+        self._known_senders = 0  # when the newest program started
         self.unready = ""
         self._started_s = self._looked_s = 0.0  # newest start, newest look at a port; wall clock
         self._known: dict[str, tuple[int, int]] = {}  # number of logged starts and ends
-        self._throttles: list[Throttle] = []
 
     def prepare(self, programs: Programs, values: dict[str, str]) -> None:
         """Fill in the placeholders in the commands of all programs.
@@ -60,14 +59,19 @@ class Crew:
     def _start(self) -> None:
         name, _ = self._waiting[0]
         self.running[name] = self._programs.start(name, self._tasks[name])
-        self._started_s = time.monotonic()
+        self._started_s, self._known_senders = time.monotonic(), len(self._senders)
         if (share := self._companion.program[name].share) < 1.0:
-            self._throttles.append(Throttle(self.running[name], share))
+            self.running[name].throttle = Throttle(self.running[name], share)
+
+    def hear(self, system: int, component: int) -> None:
+        """Note a heartbeat of a program, by its MAVLink system and component."""
+        self._senders.add((system, component))
 
     def close(self) -> None:
         """Let slowed programs run at full speed, so that they can end."""
-        for throttle in self._throttles:
-            throttle.end()
+        for program in self.running.values():
+            if program.throttle is not None:
+                program.throttle.end()
 
     def manage(self, stamp_s: float, state: VehicleState | None) -> None:
         """Log new starts and ends of programs. Start the next program if the newest one is ready.
@@ -108,7 +112,7 @@ class Crew:
             program.starts > 0
             and self.connected
             and (config.ready_line is None or program.ready)
-            and (not config.ready_heartbeat or self.heartbeat)
+            and (not config.ready_heartbeat or len(self._senders) > self._known_senders)
             and (config.ready_port is None or self._is_open(config.ready_port))
         )
 
@@ -118,6 +122,7 @@ class Crew:
             return False
         self._looked_s = time.monotonic()
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+            probe.settimeout(_PORT_LOOK_S)
             return probe.connect_ex(("127.0.0.1", port)) == 0
 
     def summary(self) -> dict[str, ProgramEnds]:
@@ -154,12 +159,18 @@ class Crew:
         return ""
 
     def ended(self) -> str:
-        """Name a program that has ended, even if it will restart.
+        """Name a program that is gone, even if it will restart.
 
-        Return an empty string if all started programs are running.
+        A program that has ended with exit code 0 is gone only if no other program runs. Return an
+        empty string if no program is gone.
         """
-        for name, program in self.running.items():
-            if program.codes and program.pid is None:
+        down = {
+            name: program.codes[-1]
+            for name, program in self.running.items()
+            if program.codes and program.pid is None
+        }
+        for name, code in down.items():
+            if code or len(down) == len(self.running):
                 return f"the program {name} is gone"
         return ""
 

@@ -1,13 +1,14 @@
 """`mavfi gate`: the gate as a process between a companion and an autopilot.
 
 A supervisor opens both links and forks a worker, which routes frames and judges setpoints. When
-the worker dies, or shows no sign of life for 1 s, the supervisor forks another on the same links.
-That one judges nothing: it passes everything (fails open), or everything but setpoints (fails
-closed).
+the worker fails or dies, or shows no sign of life for 1 s, the supervisor forks another on the same
+links. That one judges nothing: it passes everything (fails open), or everything but setpoints
+(fails closed).
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import select
@@ -17,7 +18,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.errors import MavfiError, described
 from mavfi_cli.core.files import open_own
 from mavfi_cli.core.processes import fork, interruptible
 from mavfi_cli.core.terminal import exit_code, note
@@ -32,6 +33,7 @@ from mavfi_cli.spec.detector import DetectorConfig
 
 _TURN_S = 0.1
 _HANG_S = 1.0  # silence of the worker after which it is killed
+_FAILED = 70  # exit code of a worker that an unexpected error ended
 _LOOK_S = 0.5  # interval between checks of the companion's process
 
 
@@ -107,17 +109,24 @@ class _Worker:
 
     def tell(self, text: str) -> None:
         """Print an event, and append it to the log."""
-        note(text)
-        if self._log is not None:
-            line = {"unix_s": round(time.time(), 3), "event": text}
-            os.write(self._log, json.dumps(line).encode() + b"\n")
+        line = {"unix_s": round(time.time(), 3), "event": text}
+        with contextlib.suppress(OSError):  # a full disk or a closed terminal must not end the gate
+            note(text)
+        with contextlib.suppress(OSError):
+            if self._log is not None:
+                os.write(self._log, json.dumps(line).encode() + b"\n")
 
     def work(self, alive: int, *, judges: bool) -> int:
         """Route frames until the supervisor ends this process. Return the exit code after an error.
 
         In every turn, write to the pipe `alive`, so that the supervisor sees a sign of life.
         """
-        return exit_code(lambda: self._route(alive, judges=judges))
+        try:
+            return exit_code(lambda: self._route(alive, judges=judges))
+        except Exception as error:  # the worker's boundary: the supervisor forks another
+            with contextlib.suppress(OSError):
+                self.tell(f"the gate ends: {described(error)}")
+            return _FAILED
 
     def _route(self, alive: int, *, judges: bool) -> None:
         process, gate = self._process, None
@@ -156,11 +165,16 @@ def _closed(message: Message, side: Side) -> Sequence[Message]:
 def _supervise(worker: _Worker, interrupts: Sequence[int], *, judges: bool) -> int | None:
     """Fork a worker and supervise it until it ends.
 
-    Return its exit code, 0 if this process was interrupted, or None if the worker was killed or
-    hung.
+    Return its exit code, 0 if this process was interrupted, or None if the worker was killed, hung
+    or failed.
     """
     reading, writing = os.pipe()
-    child = fork(lambda: worker.work(writing, judges=judges))
+
+    def work() -> int:
+        os.close(reading)  # a write fails once the supervisor is gone
+        return worker.work(writing, judges=judges)
+
+    child = fork(work)
     os.close(writing)
     try:
         while True:
@@ -176,7 +190,8 @@ def _supervise(worker: _Worker, interrupts: Sequence[int], *, judges: bool) -> i
         os.close(reading)
         os.kill(child, signal.SIGKILL)
         _, status = os.waitpid(child, 0)
-    return os.WEXITSTATUS(status) if os.WIFEXITED(status) else None
+    code = os.waitstatus_to_exitcode(status)
+    return None if code < 0 or code == _FAILED else code
 
 
 class _Watch:
@@ -194,14 +209,13 @@ class _Watch:
         if self._process is None or time.monotonic() < self._next_s:
             return self._gone
         self._next_s = time.monotonic() + _LOOK_S
+        gone = f"the companion's process ({self._process}) is gone"
         try:
             number = self._process if self._process.isdigit() else Path(self._process).read_text()
-            os.kill(int(number), 0)
-            self._gone = ""
-        except PermissionError:
-            self._gone = ""  # it runs as another user
-        except (OSError, ValueError, OverflowError):
-            self._gone = f"the companion's process ({self._process}) is gone"
+            _, _, fields = Path(f"/proc/{int(number)}/stat").read_text().rpartition(")")
+            self._gone = gone if fields.split()[0] in ("Z", "X") else ""  # ended, not yet awaited
+        except (OSError, ValueError):
+            self._gone = gone
         return self._gone
 
 

@@ -19,14 +19,16 @@ import select
 import signal
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import ScratchFolder, open_own, own_folder
-from mavfi_cli.core.fork_server import PACKET, ForkServer
+from mavfi_cli.core.fork_server import HALT, PACKET, ForkServer, die_with, users_environment
 
 _EVENTS = "events.jsonl"
 _STREAMS = ("stdout", "stderr")
@@ -35,6 +37,7 @@ _CHUNK, _LOOK_S = 1 << 16, 0.05
 _MOST_LINE = 4096  # bytes of a line that are searched for readiness
 _LONGEST_S = 1e6
 _GRACE_S = 2.0  # time to end after SIGTERM
+_PERIOD_S = 0.02  # cycle of running and stopping a slowed program
 
 
 # The mission's side -------------------------------------------------------------------------------
@@ -66,7 +69,7 @@ class Programs:
         place = own_folder(self._folder / name).resolve()
         own = self._scratch.path / name
         channel = self._server.start({**task, "out": str(place)}, own, _LONGEST_S)
-        program = self._running[name] = RunningProgram(name, place, channel)
+        program = self._running[name] = RunningProgram(name, place, channel, own / HALT)
         return program
 
     def close(self) -> None:
@@ -91,10 +94,13 @@ class RunningProgram:
         codes: Exit codes of the program's earlier processes; -N if signal N killed a process.
         starts: Number of times that the program has been started.
         ready: True once a line of its stdout has matched "ready_line".
+        throttle: What slows the program down, if its `share` is below 1.
     """
 
-    def __init__(self, name: str, folder: Path, channel: socket.socket) -> None:
-        self.name = name
+    throttle: Throttle | None = None
+
+    def __init__(self, name: str, folder: Path, channel: socket.socket, halt: Path) -> None:
+        self.name, self._halt = name, halt
         self.pid: int | None = None
         self.codes: list[int] = []
         self.starts = 0
@@ -139,7 +145,8 @@ class RunningProgram:
         return True
 
     def terminate(self) -> None:
-        """Resume the program if it is stopped, and ask it to end (SIGTERM)."""
+        """Resume the program if it is stopped, and ask it to end (SIGTERM). It does not restart."""
+        self._halt.touch()
         for number in (signal.SIGCONT, signal.SIGTERM):
             self.signal(number, group=True)
 
@@ -149,6 +156,45 @@ class RunningProgram:
         self._events.close()
 
 
+class Throttle(threading.Thread):
+    """Slows a program down: lets it run for a share of every 20 ms, and stops it for the rest.
+
+    The signals go to the program's process group.
+
+    Attributes:
+        share: Share of the time for which the program runs, from 0 (stopped) to 1.
+    """
+
+    def __init__(self, program: RunningProgram, share: float) -> None:
+        super().__init__(daemon=True)
+        self._program, self.share = program, share
+        self._over = threading.Event()
+        self.start()
+
+    def run(self) -> None:
+        """Alternately resume and stop the program until `end`."""
+        while not self._over.is_set():
+            share = self.share
+            if share > 0.0:
+                self._signal(signal.SIGCONT)
+                self._over.wait(share * _PERIOD_S)
+            if share < 1.0:
+                self._signal(signal.SIGSTOP)
+                self._over.wait((1.0 - share) * _PERIOD_S)
+        self._signal(signal.SIGCONT)
+
+    def _signal(self, number: int) -> None:
+        pid = self._program.pid
+        if pid is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(pid, number)
+
+    def end(self) -> None:
+        """Stop throttling, so that the program runs freely."""
+        self._over.set()
+        self.join()
+
+
 # The worker's side --------------------------------------------------------------------------------
 
 
@@ -156,12 +202,13 @@ def prepare() -> None:
     """Load nothing: the fork server calls this first, but a worker needs no further modules."""
 
 
-def perform(task: Mapping[str, Any], _folder: Path) -> NoReturn:
+def perform(task: Mapping[str, Any], folder: Path) -> NoReturn:
     """Run a program, and restart it according to its rule, until the guard kills this process.
 
     Args:
         task: "argv", "folder", "environment", "restart", "restart_s" and "ready_line", as in
             `ProgramConfig`; "out", the folder for stdout, stderr and the reports.
+        folder: Folder of this worker. Once it has a file HALT, the program is not restarted.
     """
     out = Path(task["out"])
     events = open_own(out / _EVENTS, os.O_WRONLY | os.O_APPEND)
@@ -177,6 +224,8 @@ def perform(task: Mapping[str, Any], _folder: Path) -> NoReturn:
             if not (task["restart"] == "always" or (task["restart"] == "on-failure" and code)):
                 break
             _pump(kept, report, None, time.monotonic() + float(task["restart_s"]))
+            if (folder / HALT).exists():
+                break
         _pump(kept, report, None, time.monotonic() + _LONGEST_S)
     raise MavfiError("the flight exceeded the time limit for its programs")
 
@@ -223,9 +272,9 @@ def _run(task: Mapping[str, Any], kept: Mapping[str, _Kept], report: Any) -> int
     """Start the program, store its output until it ends, and return its exit code."""
     try:
         process = subprocess.Popen(
-            task["argv"], cwd=task["folder"], env={**os.environ, **task["environment"]},
+            task["argv"], cwd=task["folder"], env={**users_environment(), **task["environment"]},
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            start_new_session=True,
+            start_new_session=True, preexec_fn=partial(die_with, os.getpid()),
         )  # fmt: skip
     except OSError as error:
         raise MavfiError(f"cannot run {task['argv'][0]}: {error.strerror}") from None

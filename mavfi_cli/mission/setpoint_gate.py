@@ -25,7 +25,7 @@ from mavfi_cli.spec.companion import GateConfig
 from mavfi_cli.spec.detector import DetectorConfig
 
 _COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER4  # sender of the gate's own messages
-_SILENT_S = 3.0  # time without a heartbeat after which a companion that sent one is gone
+_SILENT_S = 3.0  # wall-clock time without a heartbeat after which its sender is gone
 _TEXT_EVERY_S = 1.0
 _MOST_ALARMS = 100
 _BRAKE = 0b1101_1100_0111  # type_mask of a velocity-only setpoint
@@ -51,6 +51,8 @@ class SetpointGate:
         note: Called with one line of text per event.
         signing: Key of the link, for signing replacement setpoints and the gate's own messages.
         gone: Returns why the companion's process is gone; empty while it runs.
+        speed: Seconds of `now_s` per second of the wall clock, by which companions send heartbeats.
+            If it is infinite, a missing heartbeat does not show that a companion is gone.
 
     Attributes:
         outbox: Frames of the gate itself, for the autopilot and the companion. The owner sends and
@@ -70,6 +72,7 @@ class SetpointGate:
         note: Callable[[str], None],
         signing: Signing | None = None,
         gone: Callable[[], str] = str,
+        speed: float = 1.0,
     ) -> None:
         self._config, self._settings = detector, settings
         stages = frozenset(Stage(name) for name in detector.protect)
@@ -80,7 +83,9 @@ class SetpointGate:
         self._yaw_rad = 0.0  # yaw of the last accepted setpoint, kept at a standstill
         self._in_a_row = self._checks = 0
         self._counts = _Counts()
-        self._noted_s = self._handed_s = self._heartbeat_s = -math.inf
+        self._noted_s = self._handed_s = -math.inf
+        self._silent_s = _SILENT_S * speed
+        self._heartbeats: dict[tuple[int, int], float] = {}  # newest, by system and component
         self._same: tuple[Any, ...] = ()
         self._same_since_s = -math.inf
         self._failed = False
@@ -106,7 +111,7 @@ class SetpointGate:
         number = message.get_msgId()
         if side is Side.COMPANION and number not in SETPOINTS:
             if number == dialect.MAVLINK_MSG_ID_HEARTBEAT:
-                self._heartbeat_s = now_s
+                self._heartbeats[message.get_srcSystem(), message.get_srcComponent()] = now_s
             return [message]
         try:
             if side is Side.AUTOPILOT:
@@ -161,7 +166,8 @@ class SetpointGate:
     def _staleness(self, message: Message, now_s: float) -> str:
         """Return why a setpoint is stale, or an empty string if it is not.
 
-        Setpoints are stale if they no longer change, and the companion or its heartbeat is gone.
+        Setpoints are stale if they no longer change, and the companion is gone or the sender of the
+        setpoint sends no more heartbeats.
         """
         content = tuple(
             getattr(message, name) for name in message.fieldnames if name != "time_boot_ms"
@@ -173,7 +179,8 @@ class SetpointGate:
             return ""
         if why := self._gone():
             return why
-        silent = math.isfinite(self._heartbeat_s) and now_s - self._heartbeat_s > _SILENT_S
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        silent = now_s - self._heartbeats.get(sender, now_s) > self._silent_s
         return "the companion's heartbeat is gone" if silent else ""
 
     def _again(self, message: Message) -> list[Message]:

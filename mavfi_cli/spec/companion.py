@@ -38,12 +38,14 @@ class ProgramConfig:
     Attributes:
         command: Command line. Placeholders in braces are filled in.
         folder: Working folder, relative to the file of the companion.
-        environment: Variables added to mavfi's own environment.
+        environment: Variables added to the environment of mavfi. TMPDIR is a folder that mavfi
+            removes after the flight.
         restart: When to restart the program after it has ended: never, on-failure or always.
         restart_s: Wall-clock time from the program's end to its restart, s.
         ready_line: Regular expression for a line on stdout after which the program is ready.
         ready_port: TCP port of this machine that the program opens when it is ready.
-        ready_heartbeat: The program is ready when its first MAVLink heartbeat arrives.
+        ready_heartbeat: The program is ready when the first MAVLink heartbeat arrives from a system
+            and component of which none had arrived before the program started.
         ready_limit_s: Longest wall-clock time until the program is ready, s.
         share: Share of the time for which the program may run. Below 1, it is stopped for the rest
             of every 20 ms, as on a slower computer.
@@ -104,10 +106,12 @@ class SuccessConfig:
 
     Attributes:
         goal_m: The vehicle is at rest within this distance of the goal, m.
-        landed: The vehicle stands on the ground, disarmed, after a flight.
+        landed: The vehicle stands on the ground, disarmed, after a flight that no failsafe of the
+            autopilot has ended.
         exit: Name of a program that must have exited with code 0.
         corridor_m: The vehicle was never farther than this from the path of `golden`, m.
-        golden: Run folder of the flight whose path `corridor_m` refers to.
+        golden: Run folder of the flight whose path `corridor_m` refers to, relative to the current
+            folder.
     """
 
     goal_m: float | None = None
@@ -124,6 +128,11 @@ class SuccessConfig:
                 "must be given together with golden, the run folder of the flight to stay close to",
                 key="corridor_m",
             )
+
+    @property
+    def is_open(self) -> bool:
+        """True if no condition says when the flight is over."""
+        return self.goal_m is None and self.exit is None and not self.landed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,14 +178,17 @@ class CompanionConfig:
         link: mavfi's end of the companion's MAVLink link. By default it listens on a free
             port: UDP with the wall clock, TCP in lockstep. `udpout` connects to a program that
             listens on a fixed port, as PX4 does.
-        success: Conditions of success. By default, the last program must have exited with code 0.
-        time_limit_s: Limit of simulated time from arming, s; None for the mission's.
+        success: Conditions of success. Without `goal_m`, `landed` and `exit`, the last program must
+            have exited with code 0.
+        time_limit_s: Limit of simulated time from arming, s, if it is shorter than the mission's.
         flight_s: Simulated time from arming over which random faults are drawn, s; None for the
-            duration of a straight flight to the goal at the speed limit.
+            flight time of `success.golden` or, without it, the duration of a straight flight to the
+            goal at the speed limit.
         key_file: File with the signing passphrase of the link, relative to this file. A message
             that a fault changes is signed again with it.
         gate: Behaviour of the gate with `--detector`.
-        name: Name of the companion, which detector models that are fitted to it store.
+        name: Name of the companion, which detector models that are fitted to it store; None for the
+            name of its file, or "companion".
         own_network: In a campaign, each mission has a network of its own with only a loopback, if
             the operating system allows it, so that fixed ports do not collide.
         camera_heartbeat: The camera component sends heartbeats. MAVProxy and DroneKit mistake them
@@ -192,7 +204,7 @@ class CompanionConfig:
     flight_s: float | None = None
     key_file: str | None = None
     gate: GateConfig = field(default_factory=GateConfig)
-    name: str = "companion"
+    name: str | None = None
     own_network: bool = True
     camera_heartbeat: bool = True
 
@@ -215,8 +227,8 @@ class CompanionConfig:
             object.__setattr__(self, "link", ANY_PORT[self.time])
         if self.in_lockstep:
             self._check_lockstep()
-        if self.success == SuccessConfig():
-            last = SuccessConfig(exit=list(self.program)[-1])
+        if self.success.is_open:
+            last = replace(self.success, exit=list(self.program)[-1])
             object.__setattr__(self, "success", last)
 
     def _check_lockstep(self) -> None:
@@ -256,7 +268,7 @@ class CompanionConfig:
         """
         commands = {name: program.command for name, program in self.program.items()}
         digest = hashlib.sha256(json.dumps(commands).encode()).hexdigest()
-        return StackMark(name=f"{COMPANION}{self.name}", digest=digest)
+        return StackMark(name=f"{COMPANION}{self.name or 'companion'}", digest=digest)
 
     def uses(self, placeholder: str) -> bool:
         """Return True if the command of any program contains `placeholder` in braces."""
@@ -275,7 +287,7 @@ class CompanionConfig:
         path = Path(given)
         if path.suffix == ".toml":
             loaded = load_toml(path, cls)
-            loaded = replace(loaded, name=path.stem)
+            loaded = replace(loaded, name=loaded.name or path.stem)
             base = path.resolve().parent
         else:
             loaded, base = cls(program={"companion": ProgramConfig(command=given)}), Path.cwd()

@@ -4,6 +4,7 @@ It takes its time from the autopilot, so that load on the machine does not chang
 """
 
 import os
+import struct
 import sys
 import time
 
@@ -14,6 +15,7 @@ speed, end = float(sys.argv[2]), sys.argv[3]
 mav, common = link.mav, mavutil.mavlink
 VELOCITY = 0b1001_1100_0111  # ignores positions, accelerations and the yaw rate
 PREARM = common.MAV_SYS_STATUS_PREARM_CHECK
+LAND = struct.unpack("<f", struct.pack("<i", 4))[0]  # an integer parameter, as PX4 sends it
 now_s, armed, offboard = 0.0, False, False
 
 
@@ -49,8 +51,12 @@ while not (armed and offboard):
     mav.command_long_send(1, 1, common.MAV_CMD_DO_SET_MODE, 0, 1, 6, 0, 0, 0, 0, 0)
     mav.command_long_send(1, 1, common.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, 0, 0, 0, 0, 0, 0)
     fly(1, 0, 0)
+if end == "hangs":  # the failsafe is to land at once
+    mav.param_set_send(1, 1, b"COM_OBL_RC_ACT", LAND, common.MAV_PARAM_TYPE_INT32)
 fly(4, 0, -1)
 fly(4, 2, 0)
+if end == "hangs":
+    time.sleep(600)
 if end == "dies":
     os.kill(os.getpid(), 9)
 if end == "crashes":

@@ -18,10 +18,9 @@ from mavfi_cli.link.router import Side
 from mavfi_cli.mission.companion_faults import (
     CompanionInjection,
     LinkInjector,
-    Throttle,
     check_companion_fault,
 )
-from mavfi_cli.mission.programs import Programs
+from mavfi_cli.mission.programs import Programs, Throttle
 from mavfi_cli.report.summary import summary_lines
 from mavfi_cli.spec.fault import FaultConfig
 
@@ -102,6 +101,28 @@ def test_a_message_is_dropped_repeated_swapped_or_late(effect, numbers):
     assert late == ([(0, Side.COMPANION)] if "late" in effect else [])
 
 
+def test_a_swapped_message_follows_the_next_of_its_own_side():
+    link = injector("HEARTBEAT", effect="swap")
+    ours, theirs = (
+        Codec(0, 0).decode(
+            Codec(1, part).encode(dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3))
+        )
+        for part in (191, 1)
+    )
+    assert passed(link, ours) == []
+    assert passed(link, theirs, Side.AUTOPILOT) == theirs
+    assert len(passed(link, ours)) == 2
+
+
+def test_a_program_that_does_not_run_is_not_struck(tmp_path):
+    fault = CompanionInjection(FaultConfig(target="process.hop", at="time=0"), {"hop": None})
+    fault.aim_at(1.0)
+    fault.begin(tmp_path / "fault.json")
+    fault.tick(at(0.0))
+    written = fault.finish()
+    assert (written["state"], written["reason"]) == ("not_injected", "the program was not running")
+
+
 def test_a_frozen_field_stays_and_an_ignored_one_is_not_read():
     link = injector(f"{SETPOINT}.vx", effect="freeze", persistence="stuck-at", duration_s=0.25)
     values = [m.vx for m in passed(link, [setpoint(vx=vx) for vx in (1.0, 2.0, 3.0, 4.0)])]
@@ -142,7 +163,8 @@ def test_faults_that_a_companion_cannot_have(target, settings, error, problem):
         check_companion_fault(FaultConfig(target=target, **settings), {"hop": None})
 
 
-def test_a_stopped_program_does_not_run_and_goes_on(tmp_path):
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_a_stopped_program_does_not_run_and_goes_on(tmp_path, share):
     code = "import os\nwhile True: os.times()"
     task = {
         "argv": [sys.executable, "-c", code], "folder": str(tmp_path), "environment": {},
@@ -154,13 +176,29 @@ def test_a_stopped_program_does_not_run_and_goes_on(tmp_path):
         until_s = time.monotonic() + LONG_S
         while program.pid is None and time.monotonic() < until_s:
             program.poll()
-        throttle = Throttle(program, 0.0)
         stat = Path(f"/proc/{program.pid}/stat")
-        while stat.read_text().split()[2] != "T":
+
+        def states(number=100):
+            return {stat.read_text().split()[2] for _ in range(number) if not time.sleep(0.002)}
+
+        if share < 1.0:
+            program.throttle = Throttle(program, share)
+        fault = CompanionInjection(
+            FaultConfig(target="process.busy", at="time=0", effect="stop", duration_s=5.0),
+            {"busy": None},
+        )
+        fault.running = {"busy": program}
+        fault.aim_at(1.0)
+        fault.begin(tmp_path / "fault.json")
+        fault.tick(at(0.0))
+        while states() != {"T"}:
             assert time.monotonic() < until_s
-        throttle.end()
-        while stat.read_text().split()[2] == "T":
+        fault.tick(at(6.0))
+        while "R" not in states():
             assert time.monotonic() < until_s
+        if share < 1.0:
+            program.throttle.end()
+        assert "T" not in states()
         os.kill(program.pid, signal.SIGTERM)
     finally:
         programs.close()

@@ -4,6 +4,7 @@ import os
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,11 +17,12 @@ from mavfi_cli.core.errors import ConfigError, MavfiError, RecordError, UnknownN
 from mavfi_cli.core.flight_record import ProgramEnds
 from mavfi_cli.core.processes import fork, leave_network
 from mavfi_cli.link.codec import Codec
+from mavfi_cli.mission.crew import Crew
 from mavfi_cli.mission.run import fly_again
 from mavfi_cli.report.summary import summary_lines
 from mavfi_cli.report.top_view import draw_top_view
 from mavfi_cli.report.view.entries import ViewedFlight
-from mavfi_cli.spec.companion import CompanionConfig, ProgramConfig
+from mavfi_cli.spec.companion import CompanionConfig, ProgramConfig, SuccessConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 HOP = Path(__file__).with_name("hop.py")
@@ -86,6 +88,7 @@ def test_the_heartbeat_of_the_camera(fly, beats):
         ("crashes", {}, "collision", "ground"),
         ("dies", {"limit_s": 30.0}, "crash", "killed by SIGKILL"),
         ("waits", {"limit_s": 3.0}, "timeout", "never armed"),
+        ("hangs", {}, "failsafe", "a failsafe of the autopilot landed the vehicle"),
         ("waits", {"program": "ready_port = 1\nready_limit_s = 0.5"}, "crash",
          "hop was not ready within 0.5 s"),
     ],
@@ -135,6 +138,23 @@ def test_a_companion_that_cannot_fly_is_refused_before_the_flight(tmp_path, text
     path.write_text(text)
     with pytest.raises(error, match=problem):
         CompanionConfig.load(str(path))
+
+
+def test_a_corridor_alone_does_not_say_when_the_flight_is_over():
+    program = {"a": ProgramConfig(command="true")}
+    near = SuccessConfig(corridor_m=1.0, golden="golden")
+    assert CompanionConfig(program=program, success=near).success == replace(near, exit="a")
+
+
+def test_a_program_is_gone_if_it_failed_or_none_runs():
+    crew = Crew(CompanionConfig(program={"a": ProgramConfig(command="true")}), lambda *_: None)
+    a, b = SimpleNamespace(codes=[0], pid=None), SimpleNamespace(codes=[], pid=7)
+    crew.running = {"a": a, "b": b}
+    assert crew.ended() == ""
+    a.codes = [-11]
+    assert crew.ended() == "the program a is gone"
+    a.codes, b.codes, b.pid = [0], [0], None
+    assert crew.ended() == "the program a is gone"
 
 
 def test_the_vehicle_makes_a_depth_socket_for_a_companion_that_uses_it():

@@ -69,6 +69,24 @@ def test_restarts_follow_the_rule(start, tmp_path, rule, code, starts):
     assert program.starts == starts
 
 
+def test_a_program_does_not_restart_after_the_flight(start, tmp_path):
+    count = "import os, time; n = len(os.listdir('.')); open(str(n), 'w'); time.sleep(600)"
+    (tmp_path / "starts").mkdir()
+    program = start(count, restart="always", folder=str(tmp_path / "starts"))
+    awaited(program, lambda: list((tmp_path / "starts").iterdir()))
+    start.close()
+    assert len(list((tmp_path / "starts").iterdir())) == 1
+
+
+def test_a_program_has_the_environment_of_the_user(start, tmp_path, monkeypatch):
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    monkeypatch.setenv(names[0], "7")
+    monkeypatch.delenv(names[1], raising=False)
+    program = start(f"import os; print([os.environ.get(n) for n in {names}])")
+    awaited(program, lambda: program.codes)
+    assert (tmp_path / "program" / "stdout").read_text() == "['7', None]\n"
+
+
 def test_a_flood_of_output_is_kept_up_to_a_limit(start, tmp_path):
     program = start("import sys\nfor _ in range(400): sys.stdout.write('x' * 100_000)")
     awaited(program, lambda: program.codes)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from live_processes import LONG_S
 
-from mavfi_cli.core.errors import ModelError
+from mavfi_cli.core.errors import MavfiError, ModelError
 from mavfi_cli.core.types import Command, StackMark, Trajectory
 from mavfi_cli.detect.fit import fit
 from mavfi_cli.detect.offline import Dataset, FlightSamples
@@ -21,6 +21,8 @@ from mavfi_cli.detect.preprocess import PreprocessParams
 from mavfi_cli.link.codec import Codec, dialect, frame_of
 from mavfi_cli.link.router import Side
 from mavfi_cli.link.tlog import TlogWriter
+from mavfi_cli.mission import gate_process
+from mavfi_cli.mission.gate_process import require_process
 from mavfi_cli.mission.setpoint_gate import SetpointGate
 from mavfi_cli.mission.setpoints import SetpointView, command_of, samples_of_tlog
 from mavfi_cli.spec.companion import CompanionConfig, GateConfig
@@ -177,6 +179,8 @@ def test_setpoints_of_a_companion_that_is_gone_end_once_they_no_longer_change(ga
     silent = gate()
     heartbeat = received(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 0, 3))
     assert silent.pass_between(heartbeat, Side.COMPANION, 1.0) == [heartbeat]
+    other = received(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 0, 3), component=190)
+    silent.pass_between(other, Side.COMPANION, 3.5)  # says nothing about the setpoints' sender
     assert velocities(silent, [2.0] * 35) == [[2.0]] * 30 + [[]] * 5
 
 
@@ -236,6 +240,26 @@ def test_a_tlog_gives_the_samples_of_its_setpoints(tmp_path):
     assert samples.deltas.shape == (3, 13)
     assert samples.new_waypoint.all()
     assert samples.deltas[:, 10].tolist() == [0, 3, 1]  # 0, 1 and 2 m/s north
+
+
+def test_a_process_is_gone_before_its_parent_has_awaited_it():
+    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    try:
+        require_process(str(process.pid))
+        process.stdin.close()
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        with pytest.raises(MavfiError, match="is gone"):
+            require_process(str(process.pid))
+    finally:
+        process.wait()
+
+
+def test_an_unexpected_error_ends_the_worker_and_not_the_gate(monkeypatch):
+    worker = gate_process._Worker(None, None, None, None)
+    monkeypatch.setattr(worker, "_route", lambda alive, judges: 1 / 0)
+    assert gate_process._supervise(worker, (), judges=True) is None
+    monkeypatch.setattr(worker, "_route", lambda alive, judges: None)
+    assert gate_process._supervise(worker, (), judges=True) == 0
 
 
 @contextlib.contextmanager

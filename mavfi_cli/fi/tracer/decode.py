@@ -56,7 +56,7 @@ class RegisterUse:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MemoryUse:
+class _MemoryUse:
     """Memory that an instruction reads or writes, at base + index * scale + displacement."""
 
     base: str | None
@@ -100,7 +100,7 @@ class Instruction:
     text: str
     reads: tuple[RegisterUse, ...]
     writes: tuple[RegisterUse, ...]
-    memory: tuple[MemoryUse, ...]
+    memory: tuple[_MemoryUse, ...]
     elements: tuple[str | None, str | None]  # read, written: float64, float32 or neither
     scalar: bool  # computes with the lowest element of its registers only
     branches: bool  # a jump, a call or a return
@@ -161,7 +161,7 @@ def _elements(mnemonic: str) -> tuple[str | None, str | None]:
     return element, element
 
 
-def _memory(decoded: Any, operands: _Operands) -> list[MemoryUse]:
+def _memory(decoded: Any, operands: _Operands) -> list[_MemoryUse]:
     if decoded.mnemonic == "lea":
         return []
 
@@ -169,7 +169,7 @@ def _memory(decoded: Any, operands: _Operands) -> list[MemoryUse]:
         return str(decoded.reg_name(number)) if number else None
 
     return [
-        MemoryUse(
+        _MemoryUse(
             base=name(op.mem.base),
             index=name(op.mem.index),
             scale=op.mem.scale,
@@ -185,7 +185,7 @@ def _memory(decoded: Any, operands: _Operands) -> list[MemoryUse]:
     ]
 
 
-def _stack(decoded: Any) -> list[MemoryUse]:
+def _stack(decoded: Any) -> list[_MemoryUse]:
     mnemonic = decoded.mnemonic.split()[-1]  # without rep, bnd or notrack
     if mnemonic.startswith(("push", "call")):
         displacement, reads = -8, False
@@ -194,7 +194,7 @@ def _stack(decoded: Any) -> list[MemoryUse]:
     else:
         return []
     return [
-        MemoryUse(
+        _MemoryUse(
             base="rbp" if mnemonic == "leave" else "rsp",
             displacement=displacement,
             size=8,

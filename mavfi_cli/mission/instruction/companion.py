@@ -13,7 +13,7 @@ from typing import Any
 from mavfi_cli.attack.live import LiveAttack, attack_moment, mission_strategy
 from mavfi_cli.attack.tracer_thread import TracerThread
 from mavfi_cli.companion.injection import Killer
-from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.errors import MavfiError, described
 from mavfi_cli.core.flight_record import NodeCrash, NodeEnds, Strike
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.injector import Moment
@@ -151,7 +151,10 @@ class ProcessInjection(CompanionFault):
 
     def finish(self) -> dict[str, Any]:
         """Return the fault's record. Call it only after the programs have ended."""
-        return record.repeatable(self._written())
+        written = self._written()
+        if not (written.get("injection") or {}).get("applied"):
+            self.ends = {}  # the process ended by itself
+        return record.repeatable(written)
 
     def _written(self) -> FaultRecord:
         reason = self._problem or self._moment.missed
@@ -160,6 +163,8 @@ class ProcessInjection(CompanionFault):
                 return self._tracer.result().record
             except MavfiError as error:
                 reason = str(error)
+            except OSError as error:  # the process ended before it was traced
+                reason = described(error)
         undrawn = record.undrawn(**self._context)
         nothing = record.completed(undrawn, None, NOTHING, not_injected_reason=reason)
         assert self._path is not None
