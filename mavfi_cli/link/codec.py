@@ -366,10 +366,10 @@ class Codec:
 
 
 def renewed(message: Message, signing: Signing | None = None) -> Message | None:
-    """Rebuild the frame of a received message whose fields were changed.
+    """Rebuild the frame of a message whose fields were changed, or that takes another's frame.
 
-    Length, checksum and signature are recomputed, and the rest of the header is kept. Fields that
-    the dialect lacks are lost.
+    Length, message id, checksum and signature are recomputed, and the rest of the header is kept.
+    Fields that the dialect lacks are lost.
 
     Returns:
         The message with its new frame, or None if its frame is signed and `signing` is None.
@@ -379,9 +379,14 @@ def renewed(message: Message, signing: Signing | None = None) -> Message | None:
     payload, signed = kind.payload(message), old[0] == _V2 and bool(old[2] & _SIGNED)
     if signed and signing is None:
         return None
+    number = kind.number.to_bytes(3, "little")
     if old[0] == _V1:  # it has no extensions, and keeps its trailing zeros
-        payload = payload.ljust(old[1], b"\0")[: old[1]]
-    checked = bytes([len(payload)]) + old[2 : _V2_HEADER if old[0] == _V2 else _V1_HEADER] + payload
+        size = old[1] if old[5] == kind.number else kind.size
+        payload = payload.ljust(size, b"\0")[:size]
+        header = old[2:5] + number[:1]
+    else:
+        header = old[2:7] + number
+    checked = bytes([len(payload)]) + header + payload
     frame = old[:1] + checked + _crc(checked + kind.crc_extra).to_bytes(2, "little")
     if signed and signing is not None:
         frame += signing.renew(frame, old[-SIGNATURE_LENGTH:])

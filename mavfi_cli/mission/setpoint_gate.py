@@ -199,7 +199,7 @@ class SetpointGate:
     def _standstill(self, message: Message) -> list[Message]:
         """Return a setpoint with zero velocity, to be sent in place of `message`.
 
-        It becomes the reference for the next setpoint.
+        It becomes the reference for the next setpoint. The list is empty if it cannot be signed.
         """
         still = Command(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=self._yaw_rad)
         trajectory, index, _ = self._view.sample(message)
@@ -209,8 +209,9 @@ class SetpointGate:
             message.time_boot_ms, message.target_system, message.target_component,
             dialect.MAV_FRAME_LOCAL_NED, _BRAKE, *[0.0] * 11,
         )  # fmt: skip
-        codec = Codec(message.get_srcSystem(), message.get_srcComponent(), signing=self._signing)
-        return Codec(0, 0).decode(codec.encode(setpoint))
+        setpoint._msgbuf = frame_of(message)  # its sequence number, sender and signing time
+        valid = renewed(setpoint, self._signing)
+        return [] if valid is None else Codec(0, 0).decode(frame_of(valid))
 
     def _hand_over(self, now_s: float) -> None:
         """Switch the autopilot to its own hold, at most once a second."""

@@ -171,6 +171,8 @@ class MissionConfig:
             )
         if self.fault is not None:
             self.fault.check_within(self.time_limit_s)
+        if self.instruction is not None and self.companion is not None:
+            self.instruction.moment().check_within(self.time_limit_s)
         self._check_link()
         self._check_platform()
         self._check_autopilot()

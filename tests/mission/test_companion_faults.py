@@ -260,6 +260,7 @@ def test_an_instruction_of_a_program_is_struck_in_flight_and_struck_again(tmp_pa
     [
         (["--level", "instruction", "--inject", "hopp"], "did you mean 'hop'"),
         (["--level", "instruction", "--inject", "hop", "--at", "foreseen"], "got foreseen"),
+        (["--level", "instruction", "--inject", "hop", "--at", "time=400"], "time limit of 300 s"),
         (["--inject", "process.hop", "--scope", "libc.so.6"], "--level instruction"),
         (["--replay", ".", "--inject", "hop"], "--replay"),
     ],

@@ -18,7 +18,7 @@ from mavfi_cli.core.types import Command, StackMark, Trajectory
 from mavfi_cli.detect.fit import fit
 from mavfi_cli.detect.offline import Dataset, FlightSamples
 from mavfi_cli.detect.preprocess import PreprocessParams
-from mavfi_cli.link.codec import Codec, dialect, frame_of
+from mavfi_cli.link.codec import Codec, Signing, dialect, frame_of, key_from_passphrase
 from mavfi_cli.link.router import Side
 from mavfi_cli.link.tlog import TlogWriter
 from mavfi_cli.mission import gate_process
@@ -89,10 +89,12 @@ def model(tmp_path_factory):
 def gate(model):
     """A function that makes a gate; `said` are its notes."""
 
-    def made(gone=str, mark=MARK, **settings):
+    def made(gone=str, mark=MARK, signing=None, **settings):
         notes = []
         detector = DetectorConfig(name="range", model=str(model))
-        made = SetpointGate(detector, GateConfig(**settings), mark, note=notes.append, gone=gone)
+        made = SetpointGate(
+            detector, GateConfig(**settings), mark, note=notes.append, gone=gone, signing=signing
+        )
         made.said = notes
         for message in states(1000):
             assert made.pass_between(message, Side.AUTOPILOT, 1.0) == [message]
@@ -150,6 +152,20 @@ def test_the_held_setpoint_has_the_header_and_time_of_the_withheld(gate):
     (read,) = Codec(0, 0).decode(frame_of(held))
     assert (read.vx, read.time_boot_ms) == (2.0, 7)
     assert read.get_header().seq == wild.get_header().seq
+
+
+def test_a_standstill_takes_the_place_of_a_signed_setpoint_of_another_kind(gate):
+    key = key_from_passphrase("secret")
+    sender = Codec(1, 191, signing=Signing(key, lambda: 1.7e9))
+    attitude = dialect.MAVLink_set_attitude_target_message(0, 1, 1, 0, [1, 0, 0, 0], 9, 9, 9, 0.5)
+    (wild,) = Codec(0, 0).decode(sender.encode(attitude))
+    own = gate(action="brake", signing=Signing(key, time.time))
+    (still,) = own.pass_between(wild, Side.COMPANION, 1.1)
+    (read,) = Codec(0, 0, signing=Signing(key, lambda: 1.7e9)).decode(frame_of(still))
+    assert (read.get_type(), read.vx) == ("SET_POSITION_TARGET_LOCAL_NED", 0.0)
+    assert (read.get_srcComponent(), read.get_header().seq) == (191, wild.get_header().seq)
+    assert frame_of(still)[-13:-6] == frame_of(wild)[-13:-6]  # link id and signing time
+    assert gate(action="brake").pass_between(wild, Side.COMPANION, 1.1) == []
 
 
 def test_the_autopilot_is_told_to_hold_once_a_second(gate):
