@@ -8,7 +8,9 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +73,7 @@ class LiveAttack:
     reason: str
     ended: Ended | None  # None: the process continues, detached
     record: FaultRecord
+    name_symbol: Callable[[], str] = str  # reads the struck symbol, which the record lacks
 
 
 def attack_live(
@@ -147,6 +150,9 @@ def attack_moment(
     long. Under a time rule, the fault strikes where the thread is, or where a later check finds the
     thread in scope. The process runs in real time, so neither kind of fault is repeatable.
 
+    The record has no symbol, because reading the symbols of a large object stops every other thread
+    of the caller for too long. `LiveAttack.name_symbol` reads it afterwards.
+
     Args:
         objects: shared objects or executables in scope; empty for all that the process has loaded,
             except the interpreter of a Python program.
@@ -193,14 +199,15 @@ def attack_moment(
             tracee.detach()
     traced_s = round(time.perf_counter() - begun_s, 6)
     if fault is not None:
-        planned = record.planned(fault, image, **context)
+        planned = record.planned(fault, image, names_symbol=False, **context)
     done = record.completed(
         planned, injection, followed, not_injected_reason=reason, thread=thread, traced_s=traced_s
     )
     record.write(path, done)
     return LiveAttack(
-        injection=injection, followed=followed, reason=reason, ended=tracee.ended, record=done
-    )
+        injection=injection, followed=followed, reason=reason, ended=tracee.ended, record=done,
+        name_symbol=str if fault is None else partial(image.symbol, fault.target),
+    )  # fmt: skip
 
 
 def _own_objects(pid: int, image: Image) -> list[str]:

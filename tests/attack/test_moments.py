@@ -42,9 +42,9 @@ def strike(process, tmp_path, plan=UNIFORM, seed=1, **settings):
     tracer = TracerThread(
         lambda _: attack_moment(process.pid, plan, rng, path=path, kernel="workers", **settings)
     )
-    done = tracer.result().record
-    assert record.read(path) == done
-    return done
+    attack = tracer.result()
+    assert record.read(path) == attack.record
+    return {**attack.record, "symbol": attack.name_symbol()}
 
 
 def calls(process):

@@ -250,6 +250,7 @@ def test_an_instruction_of_a_program_is_struck_in_flight_and_struck_again(tmp_pa
         assert result["config"]["instruction"]["at"] == "time=4"
         assert any(event["kind"] == "fault" for event in result["events"])
     assert all(fault["state"] == "applied" and fault["node"] == "hop" for fault in faults)
+    assert faults[0]["symbol"] == faults[1]["symbol"]
     first, again = ((fault["object"], fault["offset"], fault["corruption"]) for fault in faults)
     assert first == again
     assert not first[0].startswith(("python", "libpython"))

@@ -150,11 +150,23 @@ class ProcessInjection(CompanionFault):
         return [record.describe(self._written())]
 
     def finish(self) -> dict[str, Any]:
-        """Return the fault's record. Call it only after the programs have ended."""
+        """Return the fault's record. Call it only after the programs have ended.
+
+        Only now are the symbols of the struck object read, because that would hold up the link.
+        """
         written = self._written()
+        if symbol := self._symbol():
+            written["symbol"] = symbol
+            assert self._path is not None
+            record.write(self._path, written)
         if not (written.get("injection") or {}).get("applied"):
             self.ends = {}  # the process ended by itself
         return record.repeatable(written)
+
+    def _symbol(self) -> str:
+        with contextlib.suppress(MavfiError, OSError):
+            return "" if self._tracer is None else self._tracer.result().name_symbol()
+        return ""
 
     def _written(self) -> FaultRecord:
         reason = self._problem or self._moment.missed
