@@ -99,7 +99,7 @@ class CompanionFlight:
         self._commanders: set[tuple[int, int]] = set()
         self._ticks = 0  # since the first arming
         self._mode, self._failsafe = "", False
-        self._saved = False  # a failsafe was in command when the vehicle was last in the air
+        self._failsafe_in_air = False  # in command when the vehicle was last in the air
         self._over_s = math.inf  # stamp at which every program had ended
         self._next_progress_s = 0.0
         self._crew = Crew(companion, self.logger.note)
@@ -298,7 +298,7 @@ class CompanionFlight:
             )
         self._failsafe = failsafe
         if telemetry.in_air:
-            self._saved = failsafe
+            self._failsafe_in_air = failsafe
 
     def _tick(self, state: VehicleState) -> None:
         """Record a new state, and report progress once per simulated second."""
@@ -342,7 +342,7 @@ class CompanionFlight:
         on_ground = telemetry.landed_state == dialect.MAV_LANDED_STATE_ON_GROUND
         flew = self._verdict.flew = self._verdict.flew or telemetry.in_air
         down = flew and on_ground and not telemetry.armed
-        self._verdict.landed = down and not self._saved
+        self._verdict.landed = down and not self._failsafe_in_air
         failure = self._crew.failure()
         if telemetry.collision_text is not None:
             self._end(Outcome.COLLISION, telemetry.collision_text.removeprefix("Collision: "))
@@ -356,7 +356,7 @@ class CompanionFlight:
                 self._end(Outcome.SUCCESS, self._verdict.describe())
         elif self._crew.unready:
             self._end(Outcome.CRASH, self._crew.unready)
-        elif down and self._saved and self._companion.success.landed:
+        elif down and self._failsafe_in_air and self._companion.success.landed:
             self._end(Outcome.FAILSAFE, "a failsafe of the autopilot landed the vehicle")
         elif self._is_alone() and (down or self._failsafe or not telemetry.armed):
             if failure:
