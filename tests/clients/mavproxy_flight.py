@@ -3,13 +3,14 @@
 Argument: the MAVLink URL of the vehicle.
 """
 
+import importlib.util
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from pathlib import Path
 
 PREPARE = [
     ("", r"Received \d+ parameters"),
@@ -20,10 +21,11 @@ PREPARE = [
 LAND = [("long NAV_LAND", r"LAND> (?s:.*)DISARMED")]
 OFFBOARD = "long DO_SET_MODE 1 6 0 0 0 0 0"
 
+program = Path(importlib.util.find_spec("MAVProxy").origin).with_name("mavproxy.py")
 folder = tempfile.TemporaryDirectory()  # for MAVProxy's logs
 options = ["--default-modules=arm,mode,cmdlong,misc,param", "--nowait"]
 proxy = subprocess.Popen(
-    [shutil.which("mavproxy.py"), f"--master={sys.argv[1]}", *options],
+    [sys.executable, str(program), f"--master={sys.argv[1]}", *options],
     stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=folder.name,
 )  # fmt: skip
 text, ended = "", threading.Event()
