@@ -24,7 +24,7 @@ from mavfi_cli.link.transport import Transport
 
 EPOCH_UNIX_S = 1_577_836_800  # 2020-01-01 UTC is stamp 0
 _FLUSH_BYTES = 1 << 16
-_LARGEST = 1 << 30  # largest log that is read, bytes
+_LARGEST = 1 << 30  # largest log that is written or read, bytes
 _FLUSH_INTERVAL_S = 1.0  # difference of stamps between writes
 
 
@@ -61,8 +61,8 @@ class TlogWriter:
     """Writes a .tlog file, which contains MAVLink frames and their times.
 
     If the process is killed, the file contains only whole records, and at most the last second or
-    64 KiB is missing. Records written before `open` are buffered. Every method may raise
-    RecordError.
+    64 KiB is missing. Records written before `open` are buffered. Records beyond 1 GiB are dropped.
+    Every method may raise RecordError.
 
     Args:
         epoch_unix_s: Unix time of stamp 0.
@@ -73,6 +73,7 @@ class TlogWriter:
         self._pending: list[bytes] = []
         self._pending_bytes = 0
         self._whole = 0  # length of the whole records in the file, bytes
+        self._is_full = False
         self._flushed_s = 0.0
         self._descriptor: int | None = None
 
@@ -115,6 +116,9 @@ class TlogWriter:
             return
         data, written = memoryview(b"".join(self._pending)), 0
         self._pending, self._pending_bytes = [], 0
+        self._is_full = self._is_full or self._whole + len(data) > _LARGEST
+        if self._is_full:
+            return
         try:
             while written < len(data):
                 written += os.write(self._descriptor, data[written:])

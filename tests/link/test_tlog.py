@@ -119,6 +119,17 @@ with link.recording(Path({str(path)!r})):
     assert 949 <= len(_records(path.read_bytes())) <= 1000
 
 
+def test_a_log_ends_with_a_whole_record_before_its_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mavfi_cli.link.tlog._LARGEST", 12_000)
+    path = tmp_path / "log"
+    frames = _write(path, 200)
+    kept = [frame for _, frame in _records(path.read_bytes())]
+    assert 6_000 < path.stat().st_size <= 12_000
+    assert kept == frames[: len(kept)]
+
+
 def test_a_full_disk_is_one_clear_line() -> None:
     with pytest.raises(RecordError, match=r"/dev/full: .*No space left"):
         _write(Path("/dev/full"), 1)

@@ -235,7 +235,7 @@ def test_a_struck_flight_has_a_record_of_its_fault(tmp_path, fault, outcome, lin
 def test_an_instruction_of_a_program_is_struck_in_flight_and_struck_again(tmp_path, mavfi, process):
     companion = tmp_path / "hop.toml"
     companion.write_text(
-        f"[program.hop]\ncommand = '{sys.executable} {HOP} {{link}} 2 lands'\n"
+        f"[program.hop]\ncommand = '{sys.executable} -u {HOP} {{link}} 2 lands'\n"
         "[success]\nlanded = true\n"
     )
     line = ["fly", "--companion", companion, "--world", "farm", "--speed", 2, "--time-limit", 60]
