@@ -157,6 +157,29 @@ def test_a_program_is_gone_if_it_failed_or_none_runs():
     assert crew.ended() == "the program a is gone"
 
 
+def test_only_a_heartbeat_that_was_not_heard_before_makes_a_program_ready():
+    """A program that started earlier may repeat its heartbeat at any time."""
+    started = []
+
+    def start(name, _task):
+        started.append(name)
+        return SimpleNamespace(poll=lambda: True, starts=1, codes=[], pid=7, ready=False)
+
+    config = ProgramConfig(command="true", ready_heartbeat=True)
+    crew = Crew(CompanionConfig(program={"a": config, "b": config}), lambda *_: None)
+    crew.prepare(SimpleNamespace(start=start), {})
+    for sender, names, ready in (
+        (None, ["a"], False),
+        ((1, 191), ["a", "b"], False),
+        ((1, 191), ["a", "b"], False),
+        ((1, 195), ["a", "b"], True),
+    ):
+        if sender is not None:
+            crew.hear(*sender)
+        crew.manage(0.0, None)
+        assert (started, crew.ready) == (names, ready)
+
+
 def test_the_vehicle_makes_a_depth_socket_for_a_companion_that_uses_it():
     programs = {
         "a": ProgramConfig(command="true {link}"),

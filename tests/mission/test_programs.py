@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from live_processes import LONG_S, gone
@@ -153,6 +154,18 @@ def test_no_orphan_after_a_kill_of_the_mission(tmp_path):
     owner.wait()
     owner.stdout.close()
     assert gone(pid)
+
+
+def test_a_program_ends_with_its_worker(start):
+    program = start("import time; time.sleep(600)")
+    awaited(program, lambda: program.pid is not None)
+    pid = program.pid
+    worker = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+    os.kill(worker, signal.SIGKILL)
+    assert gone(pid)
+    while program.poll():
+        time.sleep(0.01)
+    assert program.failure() == "its process was killed"
 
 
 def test_a_program_that_cannot_run_is_named(start):
