@@ -413,8 +413,9 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
     """
     CompanionParts.of(config)
     users = None if config.companion is None else CompanionConfig.load(config.companion)
-    if config.fault is not None and users is not None:
-        check_companion_fault(config.fault, users.program)
+    fault = config.fault or config.instruction
+    if fault is not None and users is not None:
+        check_companion_fault(fault, users)
     elif config.fault is not None:
         config.fault.check()
     if config.instruction is not None:
@@ -423,8 +424,6 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
         mission_strategy(config.instruction)
         if users is None:
             config.instruction.node()
-        else:
-            config.instruction.check_program(users.program)
     if config.detector is not None and users is not None:
         config.detector.build_for_companion(users.mark)
     elif config.detector is not None:

@@ -75,12 +75,13 @@ _detector, _output = section("Detector"), section("Output")
                "out.")  # fmt: skip
 @_mission("--v-max", "v_max_mps", default=3.0, help="Speed limit, m/s.")
 @_mission("--time-limit", "time_limit_s", default=300.0,
-          help="Limit of simulated time after take-off, s.")  # fmt: skip
+          help="Limit of simulated time after take-off, with --companion after arming, "
+               "s.")  # fmt: skip
 @_mission("--realtime", is_flag=True, help="Pace the simulated vehicle by the wall clock.")
 @_mission("--companion", metavar="FILE|CMD",
           help="Fly with your own companion in place of mavfi's: a TOML file or a command line, in "
                "which {link}, {goal} and others are filled in.")  # fmt: skip
-@_mission("--speed", type=types.ABOVE_ZERO, default=1.0,
+@_mission("--speed", type=types.SPEED, default=1.0,
           help="Pace of the vehicle with --companion, in times real time.")  # fmt: skip
 @_mission("--golden", "golden", type=types.MISSIONS, metavar="N",
           help="Fly the mission N times without fault and detector, and report how far the flights "
@@ -132,7 +133,8 @@ _detector, _output = section("Detector"), section("Output")
         help="Persistence: transient (once), stuck-at (held) or intermittent "
              "(repeated).")  # fmt: skip
 @_fault("--duration", "duration_s", type=types.ABOVE_ZERO,
-        help="Duration of a stuck-at or intermittent fault, s  [until the end].")  # fmt: skip
+        help="Duration of a stuck-at or intermittent fault, or of stop and slow, s  [until the "
+             "end].")  # fmt: skip
 @_fault("--restart", "node_restart_s", default=1.0,
         help="Time until a dead node works again, s; 3600 means never.")  # fmt: skip
 @_instruction("--level", type=click.Choice(["source", "instruction"]), default="source",
@@ -213,6 +215,7 @@ def fly(
             raise click.UsageError(
                 "--golden needs --companion, because other flights repeat exactly"
             )
+        refuse_given({"expect", "record", "replay"}, "has no effect with --golden")
         from mavfi_cli.studies.spread import fly_spread
 
         with progress_view(mission, quiet=quiet) as view:
@@ -253,12 +256,20 @@ def fly(
 
 
 def _hint(run: Run) -> list[str]:
-    """Return lines that suggest a fault with a large effect, if this one had a tiny effect.
+    """Return lines that suggest another setting, if the fault had little or no effect.
 
     The list is empty unless the fault changed values by little and the mission succeeded, without a
-    detector and without --config.
+    detector and without --config; or a companion's flight ended before a random time.
     """
     record = run.record
+    fault = record.state_fault or record.instruction_fault
+    drawn = (record.config["fault"] or record.config["instruction"] or {}).get("at") == "random"
+    if fault is not None and fault.state == "not_injected" and drawn and record.programs:
+        return [
+            "",
+            "A random time may fall after the end of the flight; set flight_s in the companion's "
+            "file to the length of its flight.",
+        ]
     changes = [change for strike in record.strikes for change in strike.changes]
     small = (
         change.before is not None
@@ -392,7 +403,7 @@ def _faults(
         if companion is None:
             fault.check()
         else:
-            check_companion_fault(fault, CompanionConfig.load(companion).program)
+            check_companion_fault(fault, CompanionConfig.load(companion))
         return fault, None
     mission_strategy(fault)  # rejects unknown names before the flight
     companion = given.get("companion", base.companion)
@@ -401,7 +412,7 @@ def _faults(
         refuse_given({"at"}, "needs --level source, or --companion")
         fault.node()
     else:
-        fault.check_program(CompanionConfig.load(companion).program)
+        check_companion_fault(fault, CompanionConfig.load(companion))
     return None, fault
 
 
@@ -418,6 +429,7 @@ def _recorded_fault(run: Path, companion: str | None) -> InstructionConfig:
     """
     from mavfi_cli.core.config import structure
     from mavfi_cli.fi.tracer.record import fault_of
+    from mavfi_cli.mission.companion_faults import check_companion_fault
     from mavfi_cli.spec.companion import CompanionConfig
     from mavfi_cli.spec.fault import InstructionConfig
 
@@ -431,7 +443,7 @@ def _recorded_fault(run: Path, companion: str | None) -> InstructionConfig:
     if recorded["trigger"]:
         fault_of(recorded)  # refuses a damaged record
     fault = structure(recorded.get("request") or {}, InstructionConfig)
-    fault.check_program(CompanionConfig.load(companion).program)
+    check_companion_fault(fault, CompanionConfig.load(companion))
     return fault
 
 

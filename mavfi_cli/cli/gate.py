@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,9 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @_detector("--threshold", type=types.ABOVE_ZERO, help="Score above which a setpoint is withheld  "
            "[the model's].")  # fmt: skip
 @_detector("--companion", "file", metavar="FILE",
-           help="Companion for which the model must be made  [any].")  # fmt: skip
+           help="Companion for which the model must be made  [any]. Its [gate] table and its "
+                "key_file are the defaults of the options below and of "
+                "--key-file.")  # fmt: skip
 @_action("--action", default="hold", type=click.Choice(["hold", "brake", "autopilot"]),
          help="What takes the place of a withheld setpoint: the last accepted one, a standstill, "
               "or the autopilot's own hold.")  # fmt: skip
@@ -40,8 +43,8 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
          help="Time without a change after which the setpoints of a companion that is gone are "
               "withheld, s.")  # fmt: skip
 @_action("--process", metavar="PID|FILE",
-         help="Process of the companion, or a file with its number; when it is gone, the companion "
-              "is  [only its heartbeat counts].")  # fmt: skip
+         help="Process of the companion, or a file with its number. When this process ends, the "
+              "companion counts as gone  [only heartbeats are watched].")  # fmt: skip
 @_action("--fail", "on_error", default="open", type=click.Choice(["open", "closed"]),
          help="If the gate itself fails: open passes setpoints, closed withholds "
               "them.")  # fmt: skip
@@ -62,10 +65,13 @@ def gate(file: str | None, process: str | None, **options: Any) -> None:
         name=options["detector"], threshold=options["threshold"],
         model=None if model is None else str(model),
     )  # fmt: skip
+    settings, mark, key_file = GateConfig(), None, options["key_file"]
+    if file is not None:
+        guarded = CompanionConfig.load(file, starts=False)
+        settings, mark, key_file = guarded.gate, guarded.mark, key_file or guarded.key_file
     code = GateProcess(
         autopilot=options["autopilot"], companion=options["companion"], detector=detector,
-        settings=GateConfig(**given_fields(GateConfig)), process=process,
-        mark=None if file is None else CompanionConfig.load(file).mark, log=options["log"],
-        key_file=options["key_file"], allow_unsigned=options["allow_unsigned"],
+        settings=replace(settings, **given_fields(GateConfig)), process=process, mark=mark,
+        log=options["log"], key_file=key_file, allow_unsigned=options["allow_unsigned"],
     ).run()  # fmt: skip
     raise click.exceptions.Exit(code)

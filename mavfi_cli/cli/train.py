@@ -34,8 +34,9 @@ _LOG = click.Path(path_type=Path, exists=True, dir_okay=False)
         help="Do not fly; fit to the error-free flights among the run folders in this folder. Any "
              "autopilot may have flown them.")  # fmt: skip
 @option("--companion", metavar="FILE|CMD",
-        help="Fly your own companion, and fit models for the gate before it.")  # fmt: skip
-@option("--speed", type=types.ABOVE_ZERO, default=1.0,
+        help="Fly your own companion, and fit models for its gate. With --from, name the "
+             "companion that flew.")  # fmt: skip
+@option("--speed", type=types.SPEED, default=1.0,
         help="Pace of the vehicle with --companion, in times real time.")  # fmt: skip
 @option("--from", "log", type=_LOG,
         help="Do not fly; fit to this .tlog of a fault-free flight of your own companion and to "
@@ -73,7 +74,7 @@ def train(out: Path, as_json: bool, quiet: bool, **options: Any) -> None:
         refuse_given(_FLYING | {"flown"}, "has no effect with --from")
         if options["log"] is None:
             raise click.UsageError(f"{logs[0]}: the first log file must follow --from")
-    if options["companion"] and flown is None and "worlds" not in given_options():
+    if options["companion"] and flown is None and not logs and "worlds" not in given_options():
         raise click.UsageError("--companion needs --world")
     if not options["companion"]:
         refuse_given({"speed"}, "needs --companion")

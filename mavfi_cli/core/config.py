@@ -64,6 +64,10 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
             raise ConfigError(str(error), path=path) from None
         line, _, column = place.rstrip(")").partition(", ")
         raise ConfigError(f"{problem} ({column})", path=path, line=int(line)) from None
+    except ValueError:  # Python refuses to convert it
+        raise ConfigError("an integer has too many digits", path=path) from None
+    except RecursionError:
+        raise ConfigError("arrays or tables are nested too deeply", path=path) from None
 
 
 def toml_text(values: Mapping[str, Any]) -> str:

@@ -9,17 +9,19 @@ from types import MappingProxyType
 from typing import Any
 
 from mavfi_cli.companion.injection import Killer, NoInjection, SourceInjection
-from mavfi_cli.core.errors import FaultSpecError
+from mavfi_cli.core.errors import FaultSpecError, UnknownName
 from mavfi_cli.core.flight_record import NodeEnds, Strike
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.bits import NUMPY_TYPES
-from mavfi_cli.fi.fault import Effect
+from mavfi_cli.fi.fault import Effect, When
 from mavfi_cli.fi.injector import Injector, Listener, Moment, Pattern, change_of
 from mavfi_cli.link.codec import Message, Signing, renewed
 from mavfi_cli.link.fields import is_ignored
 from mavfi_cli.link.router import Side
+from mavfi_cli.link.telemetry import ARDUCOPTER, PX4
 from mavfi_cli.mission.programs import RunningProgram, Throttle
-from mavfi_cli.spec.fault import PROCESS, FaultConfig
+from mavfi_cli.spec.companion import CompanionConfig
+from mavfi_cli.spec.fault import PROCESS, FaultConfig, InstructionConfig
 
 _SIDES = {None: None, "output": Side.COMPANION, "input": Side.AUTOPILOT}
 _RECEIVERS = {Side.COMPANION: "autopilot", Side.AUTOPILOT: "companion"}
@@ -171,23 +173,16 @@ class CompanionInjection(CompanionFault, SourceInjection):
     """Injection of one fault into the messages or the processes of a user's companion.
 
     Args:
-        programs: The companion's programs by name.
+        config: A fault that `check_companion_fault` accepts.
         signing: As for `LinkInjector`.
-
-    Raises:
-        FaultSpecError: The target of the fault does not exist in a user's companion.
-        UnknownName: This companion has no such program, or MAVLink no such message or field.
     """
 
-    def __init__(
-        self, config: FaultConfig, programs: Mapping[str, Any], signing: Signing | None = None
-    ) -> None:
+    def __init__(self, config: FaultConfig, signing: Signing | None = None) -> None:
         super().__init__(config)
         self._signing = signing
         self._throttle: Throttle | None = None
         self._usual_share: float | None = None  # of a program that its own file slows down
         self._until_s = math.inf
-        check_companion_fault(config, programs)
 
     def aim_at(self, shortest_flight_s: float) -> None:
         """Draw the fault, as described in `CompanionFault.aim_at`."""
@@ -251,12 +246,26 @@ class CompanionInjection(CompanionFault, SourceInjection):
         self._until_s = strike.stamp_s + corruption.duration_s
 
 
-def check_companion_fault(config: FaultConfig, programs: Mapping[str, Any]) -> None:
-    """Raise an error if a fault cannot be injected into a user's companion.
+def check_companion_fault(
+    config: FaultConfig | InstructionConfig, companion: CompanionConfig
+) -> None:
+    """Check that a fault can be injected into a user's companion.
 
-    The errors are those of `CompanionInjection`.
+    Raises:
+        FaultSpecError: The target does not exist in a user's companion, or settings contradict each
+            other.
+        UnknownName: The companion has no such program, MAVLink no such message or field, or the
+            autopilots no such flight mode.
     """
-    if config.wire_target is not None:
+    programs = companion.program
+    kind, _, phase = config.at.partition("=")
+    if kind == When.PHASE.value and phase not in (modes := {**PX4.modes, **ARDUCOPTER.modes}):
+        raise UnknownName("flight mode", phase, modes)
+    moment = config.moment() if isinstance(config, InstructionConfig) else config
+    moment.check_within(companion.time_limit_s or math.inf)
+    if isinstance(config, InstructionConfig):
+        config.check_program(programs)
+    elif config.wire_target is not None:
         config.draw_wire()
     elif config.killed_node is not None:
         config.check_program(programs)

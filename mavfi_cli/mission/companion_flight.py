@@ -369,7 +369,7 @@ class CompanionFlight:
             late = "" if armed_once else "the companion never armed the vehicle"
             self._end(Outcome.TIMEOUT, failure or late)
         elif time.monotonic() - self._heard_s > _SILENCE_S:
-            self._end(Outcome.LINK_LOST, f"the vehicle said nothing for {_SILENCE_S:g} s")
+            self._end(Outcome.LINK_LOST, f"the vehicle sent nothing for {_SILENCE_S:g} s")
 
     def _is_alone(self) -> bool:
         """Return True if all programs have ended, and a heartbeat has told their last effect."""
@@ -451,7 +451,7 @@ class LockstepFlight(CompanionFlight):
             self._end(Outcome.INTERRUPTED)
         elif self._awaited_ms is None:
             if waited_s > _SILENCE_S:
-                self._end(Outcome.LINK_LOST, f"the vehicle said nothing for {_SILENCE_S:g} s")
+                self._end(Outcome.LINK_LOST, f"the vehicle sent nothing for {_SILENCE_S:g} s")
         elif waited_s > limit_s:
             name, *_ = self._crew.running
             text = f"{name} did not answer the tick at {self._tick_ms} ms within {limit_s:g} s"
@@ -590,7 +590,7 @@ class _Verdict:
         """
         success = self._success
         ends = (
-            *([self._rests] if success.goal_m is not None else ()),
+            *([self._rests and self.flew] if success.goal_m is not None else ()),
             *([self.landed] if success.landed else ()),
             *([self._crew.succeeded(success.exit)] if success.exit is not None else ()),
         )

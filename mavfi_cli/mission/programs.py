@@ -270,9 +270,10 @@ class _Ready:
 
 def _run(task: Mapping[str, Any], kept: Mapping[str, _Kept], report: Any) -> int:
     """Start the program, store its output until it ends, and return its exit code."""
+    usual = {"PYTHONUNBUFFERED": "1", **users_environment()}
     try:
         process = subprocess.Popen(
-            task["argv"], cwd=task["folder"], env={**users_environment(), **task["environment"]},
+            task["argv"], cwd=task["folder"], env={**usual, **task["environment"]},
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             start_new_session=True, preexec_fn=partial(die_with, os.getpid()),
         )  # fmt: skip

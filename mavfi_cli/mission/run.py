@@ -39,7 +39,11 @@ from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.types import FlightTruth, FloatArray, Outcome, Reaction
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.link.transport import signing_from_file
-from mavfi_cli.mission.companion_faults import CompanionFault, CompanionInjection
+from mavfi_cli.mission.companion_faults import (
+    CompanionFault,
+    CompanionInjection,
+    check_companion_fault,
+)
 from mavfi_cli.mission.companion_flight import CompanionFlight, LockstepFlight
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.instruction import CACHE
@@ -147,13 +151,15 @@ def _fly_companion(
         SetpointGate.warm_up(config.detector, programs.mark)
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
     injection = CompanionFault()
+    if (fault := config.fault or config.instruction) is not None:
+        check_companion_fault(fault, programs)
     if config.fault is not None:
         key = signing_from_file(programs.key_file)
-        injection = CompanionInjection(config.fault, programs.program, key)
+        injection = CompanionInjection(config.fault, key)
     elif config.instruction is not None:
         from mavfi_cli.mission.instruction.companion import ProcessInjection  # loads the tracer
 
-        injection = ProcessInjection(config.instruction, programs.program, repeat)
+        injection = ProcessInjection(config.instruction, repeat)
     kind, launch = CompanionFlight, Vehicle.start
     if programs.in_lockstep:
         kind, launch = LockstepFlight, Vehicle.start_in_lockstep

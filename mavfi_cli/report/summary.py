@@ -163,7 +163,7 @@ def _node_lines(nodes: Mapping[str, NodeEnds]) -> list[str]:
 def _program_lines(programs: Mapping[str, ProgramEnds]) -> list[str]:
     lines = []
     for name, program in programs.items():
-        ends = ", ".join(map(str, program.codes)) or "runs until the end"
+        ends = ", ".join(map(str, program.codes)) or "still running at the end"
         lines.append(f"Program     {name}: started {program.starts}x; exit codes: {ends}")
     return lines
 
@@ -235,6 +235,13 @@ def event_lines(flight: FlightRecord) -> list[str]:
     return [f"{e.stamp_s:9.2f} s  {e.kind:<10} {e.text}" for e in flight.events]
 
 
+_MESSAGES = {
+    "message": "message",
+    "output": "message from the companion,",
+    "input": "message to the companion,",
+}
+
+
 def _fault_lines(flight: FlightRecord) -> list[str]:
     if flight.instruction_fault is not None:
         return _instruction_lines(flight.instruction_fault)
@@ -251,13 +258,11 @@ def _fault_lines(flight: FlightRecord) -> list[str]:
         "invocation": f"at invocation {trigger.number:g} of the kernel",
     }[trigger.when]
     request, states = fault.request, ", ".join(fault.states)
-    what = f"{fault.stage} stage, {states}: {request['persistence']} {request['effect']}"
-    is_value = "" not in fault.units[:1]
+    place = _MESSAGES.get(fault.stage, f"{fault.stage} stage,")
+    what = f"{place} {states}: {request['persistence']} {request['effect']}"
     if fault.stage == "process":
         struck = {"flip": "is killed", "stop": "is stopped"}
         what = f"{states} {struck.get(request['effect'], request['effect'])}"
-    elif not is_value:  # a whole message
-        what = f"{fault.stage}, {states}: {request['persistence']} {request['effect']}"
     lines = [f"Fault       {what}, {when}"]
     if fault.state == "not_injected":
         lines.append(f"            not injected: {fault.reason}")
@@ -265,7 +270,7 @@ def _fault_lines(flight: FlightRecord) -> list[str]:
         lines += [_change_line(strike.stamp_s, change) for change in strike.changes]
     if fault.strike_count and fault.strike_count > 3:
         lines.append(f"            and {fault.strike_count - 3} more strikes")
-    if fault.state == "applied" and is_value and fault.activation is not None:
+    if fault.state == "applied" and "" not in fault.units[:1] and fault.activation is not None:
         lines.append(f"            {_activation(fault.activation)}")
     return lines
 

@@ -4,31 +4,57 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import re
 import shlex
 import shutil
 import stat
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mavfi_cli.core.config import load_toml
-from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.core.errors import ConfigError, LinkError, UnknownName
 from mavfi_cli.core.types import StackMark
+from mavfi_cli.link.endpoint import parse_endpoint
 from mavfi_cli.spec.detector import COMPANION
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 RESTARTS = ("never", "on-failure", "always")
 ACTIONS, ON_ERROR = ("hold", "brake", "autopilot"), ("open", "closed")
 TIMES = ("wall", "lockstep")
-ANY_PORT = {"wall": "udpin:127.0.0.1:0", "lockstep": "tcpin:127.0.0.1:0"}
-_PLACEHOLDER = re.compile(r"\{([a-z]+)\}")
+_ANY_PORT = {"wall": "udpin:127.0.0.1:0", "lockstep": "tcpin:127.0.0.1:0"}
+PLACEHOLDERS = (
+    "link", "mavsdk", "port", "free", "briefing", "depth", "world", "start", "goal", "seed",
+)  # fmt: skip
+_PLACEHOLDER = re.compile(r"\{\{(\w+)\}\}|\{(\w+)\}")  # {{word}} stands for the text {word}
 _LONGEST_S = 3600.0
+LIMITS = {  # minimum and maximum of each number
+    "restart_s": (0.0, _LONGEST_S),
+    "ready_port": (1.0, 65_535.0),
+    "ready_limit_s": (0.1, _LONGEST_S),
+    "share": (0.01, 1.0),
+    "goal_m": (0.1, 50.0),
+    "corridor_m": (0.01, 1e4),
+    "patience": (0.0, 1000.0),
+    "stale_s": (0.1, _LONGEST_S),
+    "answer_limit_s": (0.1, _LONGEST_S),
+    "time_limit_s": (1.0, 86_400.0),
+    "flight_s": (0.1, 86_400.0),
+}
 
 
-def _require_range(key: str, value: float | None, low: float, high: float) -> None:
-    if value is not None and not low <= value <= high:
-        raise ConfigError(f"must be between {low:g} and {high:g}, got {value:g}", key=key)
+def _require_limits(config: DataclassInstance) -> None:
+    for own in fields(config):
+        low, high = LIMITS.get(own.name, (-math.inf, math.inf))
+        value = getattr(config, own.name)
+        if own.name in LIMITS and value is not None and not low <= value <= high:
+            got = "a larger number" if value > high else f"{value:g}"
+            raise ConfigError(f"must be between {low:g} and {high:g}, got {got}", key=own.name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,16 +62,16 @@ class ProgramConfig:
     """One program of a user's companion: how mavfi starts, awaits and restarts it.
 
     Attributes:
-        command: Command line. Placeholders in braces are filled in.
+        command: Command line, which runs without a shell. Placeholders in braces are filled in.
         folder: Working folder, relative to the file of the companion.
         environment: Variables added to the environment of mavfi. TMPDIR is a folder that mavfi
-            removes after the flight.
+            removes after the flight. PYTHONUNBUFFERED is 1 unless it is set.
         restart: When to restart the program after it has ended: never, on-failure or always.
         restart_s: Wall-clock time from the program's end to its restart, s.
         ready_line: Regular expression for a line on stdout after which the program is ready.
         ready_port: TCP port of this machine that the program opens when it is ready.
         ready_heartbeat: The program is ready when the first MAVLink heartbeat arrives from a system
-            and component of which none had arrived before the program started.
+            and component that had sent none before the program started.
         ready_limit_s: Longest wall-clock time until the program is ready, s.
         share: Share of the time for which the program may run. Below 1, it is stopped for the rest
             of every 20 ms, as on a slower computer.
@@ -65,28 +91,39 @@ class ProgramConfig:
     def __post_init__(self) -> None:
         if not _words(self.command):
             raise ConfigError("must name a program, but is empty", key="command")
+        self._check_texts()
+        for name in self.placeholders:
+            if name not in PLACEHOLDERS:
+                problem = UnknownName("placeholder", name, PLACEHOLDERS)
+                raise ConfigError(
+                    f"{problem}; write {{{{{name}}}}} for the text {{{name}}}", key="command"
+                )
         if self.restart not in RESTARTS:
             raise UnknownName("restart rule", self.restart, RESTARTS)
-        _require_range("restart_s", self.restart_s, 0.0, _LONGEST_S)
-        _require_range("ready_port", self.ready_port, 1, 65_535)
-        _require_range("share", self.share, 0.01, 1.0)
-        _require_range("ready_limit_s", self.ready_limit_s, 0.1, _LONGEST_S)
+        _require_limits(self)
         try:
-            re.compile(self.ready_line or "")
-        except re.error as error:
+            re.compile((self.ready_line or "").encode())
+        except (re.error, UnicodeError) as error:
             raise ConfigError(f"must be a regular expression: {error}", key="ready_line") from None
 
-    def argv(self, values: Mapping[str, str]) -> list[str]:
-        """Split the command into words, and replace each placeholder with its value in `values`.
+    def _check_texts(self) -> None:
+        """Reject what the operating system cannot pass on: NUL, and names without a value."""
+        if "\0" in self.command:
+            raise ConfigError("must not contain NUL", key="command")
+        for name, value in self.environment.items():
+            if not name or "=" in name or "\0" in name + value:
+                raise ConfigError(f"cannot set the variable {name!r}", key="environment")
 
-        Raises:
-            UnknownName: A name in braces is not a key of `values`. The error suggests the nearest.
-        """
+    @property
+    def placeholders(self) -> list[str]:
+        """Names of the placeholders in the command."""
+        return [name for _, name in _PLACEHOLDER.findall(self.command) if name]
+
+    def argv(self, values: Mapping[str, str]) -> list[str]:
+        """Split the command into words, and replace each placeholder with its value in `values`."""
 
         def filled(match: re.Match[str]) -> str:
-            if match[1] not in values:
-                raise UnknownName("placeholder", match[1], values)
-            return values[match[1]]
+            return f"{{{match[1]}}}" if match[1] else values[match[2]]
 
         return [_PLACEHOLDER.sub(filled, word) for word in _words(self.command)]
 
@@ -105,13 +142,14 @@ class SuccessConfig:
     All conditions that are set must hold, and no collision may occur.
 
     Attributes:
-        goal_m: The vehicle is at rest within this distance of the goal, m.
+        goal_m: The vehicle has flown, and moves at less than 0.5 m/s for 1 s within this distance
+            of the goal, m.
         landed: The vehicle stands on the ground, disarmed, after a flight that no failsafe of the
             autopilot has ended.
         exit: Name of a program that must have exited with code 0.
         corridor_m: The vehicle was never farther than this from the path of `golden`, m.
-        golden: Run folder of the flight whose path `corridor_m` refers to, relative to the current
-            folder.
+        golden: Run folder of the flight whose path `corridor_m` refers to, relative to the file of
+            the companion.
     """
 
     goal_m: float | None = None
@@ -121,8 +159,7 @@ class SuccessConfig:
     golden: str | None = None
 
     def __post_init__(self) -> None:
-        _require_range("goal_m", self.goal_m, 0.1, 50.0)
-        _require_range("corridor_m", self.corridor_m, 0.01, 1e4)
+        _require_limits(self)
         if (self.corridor_m is None) != (self.golden is None):
             raise ConfigError(
                 "must be given together with golden, the run folder of the flight to stay close to",
@@ -161,8 +198,7 @@ class GateConfig:
             raise UnknownName("action", self.action, ACTIONS)
         if self.on_error not in ON_ERROR:
             raise UnknownName("on_error", self.on_error, ON_ERROR)
-        _require_range("patience", self.patience, 0, 1000)
-        _require_range("stale_s", self.stale_s, 0.1, _LONGEST_S)
+        _require_limits(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,9 +211,9 @@ class CompanionConfig:
         time: Clock of the flight: `wall`, the wall clock, or `lockstep`, in which every tick waits
             for the companion's answer.
         answer_limit_s: Longest wall-clock time until an answer in lockstep, s.
-        link: mavfi's end of the companion's MAVLink link. By default it listens on a free
-            port: UDP with the wall clock, TCP in lockstep. `udpout` connects to a program that
-            listens on a fixed port, as PX4 does.
+        link: mavfi's end of the companion's MAVLink link, on this machine. By default it listens on
+            a free port: `udpin:127.0.0.1:0` with the wall clock, `tcpin:127.0.0.1:0` in lockstep.
+            `udpout:127.0.0.1:PORT` sends to a program that listens on a fixed port, as PX4 does.
         success: Conditions of success. Without `goal_m`, `landed` and `exit`, the last program must
             have exited with code 0.
         time_limit_s: Limit of simulated time from arming, s, if it is shorter than the mission's.
@@ -216,20 +252,38 @@ class CompanionConfig:
                 raise ConfigError(
                     f"the name must be 1 to 40 letters, digits, - or _, got {name!r}", key=name
                 )
-        _require_range("time_limit_s", self.time_limit_s, 1.0, 86_400.0)
-        _require_range("flight_s", self.flight_s, 0.1, 86_400.0)
+        _require_limits(self)
+        if (self.flight_s or 0.0) > (self.time_limit_s or math.inf):
+            raise ConfigError("must be at most time_limit_s", key="flight_s")
         if self.success.exit is not None and self.success.exit not in self.program:
             raise UnknownName("program", self.success.exit, self.program)
-        _require_range("answer_limit_s", self.answer_limit_s, 0.1, _LONGEST_S)
         if self.time not in TIMES:
             raise UnknownName("time", self.time, TIMES)
         if self.link is None:
-            object.__setattr__(self, "link", ANY_PORT[self.time])
+            object.__setattr__(self, "link", _ANY_PORT[self.time])
+        self._check_link()
         if self.in_lockstep:
             self._check_lockstep()
         if self.success.is_open:
             last = replace(self.success, exit=list(self.program)[-1])
             object.__setattr__(self, "success", last)
+        ends = self.success.exit
+        if ends is not None and self.program[ends].restart == "always":
+            raise ConfigError(
+                "always restarts, so it never counts as ended: set success.landed or "
+                "success.goal_m, or another success.exit", key=f"program.{ends}.restart",
+            )  # fmt: skip
+
+    def _check_link(self) -> None:
+        """Reject a link beyond this machine, and one that needs a listening program."""
+        try:
+            end = parse_endpoint(self.url)
+        except LinkError as error:
+            raise ConfigError(str(error), key="link") from None
+        if end.scheme not in ("udpin", "udpout", "tcpin") or end.host != "127.0.0.1":
+            raise ConfigError(
+                f"must be udpin:, udpout: or tcpin: on 127.0.0.1, got {self.url}", key="link"
+            )
 
     def _check_lockstep(self) -> None:
         """Reject settings that lockstep does not support.
@@ -272,20 +326,42 @@ class CompanionConfig:
 
     def uses(self, placeholder: str) -> bool:
         """Return True if the command of any program contains `placeholder` in braces."""
-        return any(
-            placeholder in _PLACEHOLDER.findall(own.command) for own in self.program.values()
+        return any(placeholder in own.placeholders for own in self.program.values())
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Paths of the scripts and other files that the commands name, except those on PATH."""
+        named = [
+            Path(program.folder) / word
+            for program in self.program.values()
+            for word in _words(program.command)
+        ]
+        here = Path.cwd()
+        places = (
+            place.relative_to(here) if place.is_relative_to(here) else place for place in named
         )
+        return tuple(dict.fromkeys(str(place) for place in places if place.is_file()))
+
+    @staticmethod
+    def is_file(given: str) -> bool:
+        """Return True if `--companion` names a TOML file, and False if it is a command line."""
+        path = Path(given)
+        return path.suffix == ".toml" and (path.is_file() or len(given.split()) == 1)
 
     @classmethod
-    def load(cls, given: str) -> CompanionConfig:
+    def load(cls, given: str, *, starts: bool = True) -> CompanionConfig:
         """Load a companion from the TOML file `given`, or build one that runs `given` as a command.
 
+        Args:
+            starts: Also check that its programs can be started on this machine.
+
         Raises:
-            ConfigError: The file cannot be used, or a program cannot be started.
+            ConfigError: The file or the file of its passphrase cannot be used, or a program cannot
+                be started.
             UnknownName: A name in the file does not exist.
         """
         path = Path(given)
-        if path.suffix == ".toml":
+        if cls.is_file(given):
             loaded = load_toml(path, cls)
             loaded = replace(loaded, name=loaded.name or path.stem)
             base = path.resolve().parent
@@ -295,10 +371,18 @@ class CompanionConfig:
             name: replace(program, folder=str(base / program.folder))
             for name, program in loaded.program.items()
         }
-        for name, program in placed.items():
-            _require_startable(name, program)
+        if starts:
+            for name, program in placed.items():
+                _require_startable(name, program)
         key_file = None if loaded.key_file is None else str(base / loaded.key_file)
-        return replace(loaded, program=placed, key_file=key_file)
+        if key_file is not None:
+            from mavfi_cli.link.transport import signing_from_file  # loads pymavlink
+
+            signing_from_file(key_file)
+        success, golden = loaded.success, loaded.success.golden
+        if golden is not None:
+            success = replace(success, golden=str(base / golden))
+        return replace(loaded, program=placed, key_file=key_file, success=success)
 
 
 def _require_startable(name: str, program: ProgramConfig) -> None:

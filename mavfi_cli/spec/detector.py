@@ -163,7 +163,7 @@ class DetectorConfig:
         made_for = detector.stack if isinstance(detector, FittedDetector) else None
         if made_for is None or self.any_stack:
             return detector
-        fit = "fit one with mavfi train --companion"
+        fit = "fit one with mavfi train --companion, from new flights or with --from"
         if path is None:
             problem = f"{self.name} needs --model, a model fitted to the companion; {fit}"
             raise ModelError(problem).as_usage()
@@ -175,7 +175,8 @@ class DetectorConfig:
         if mark is not None and mark.digest != made_for.digest:
             raise ModelError(
                 f"this model was fitted to {made_for.name!r}, not to {mark.name!r} with its "
-                f"present commands; {fit}, or allow this model with --any-stack-model",
+                f"present commands; {fit}, or allow this model with --any-stack-model (mavfi gate: "
+                "leave out --companion)",
                 path=path,
             )
         return detector

@@ -167,17 +167,22 @@ class FaultConfig:
 
         Raises:
             UnknownName: No program or effect has this name.
-            FaultSpecError: A process cannot have this effect, trigger or persistence.
+            FaultSpecError: A process cannot have this effect, trigger or another setting.
         """
         name = self.killed_node
         if name not in programs:
             raise UnknownName("program", name or "", programs)
-        corruption = self.corruption()
-        require_effect(self.target, corruption.effect, OF_PROCESSES)
+        effect = self.corruption().effect
+        require_effect(self.target, effect, OF_PROCESSES)
         self._check_trigger_of_process()
-        if corruption.persistence is not Persistence.TRANSIENT:
+        plain = FaultConfig(
+            target=self.target, seed=self.seed, at=self.at, effect=self.effect,
+            duration_s=None if effect is Effect.FLIP else self.duration_s,
+        )  # fmt: skip
+        if self != plain:
             raise FaultSpecError(
-                f"{self.target}: a fault in a process must be transient, got {self.persistence}"
+                f"{self.target}: a fault in a process takes a seed, a trigger and an effect, and "
+                "with the effects stop and slow a duration"
             )
 
     def draw_wire(self) -> tuple[WireFields, SourceFault | None]:
@@ -206,6 +211,11 @@ class FaultConfig:
                 raise FaultSpecError(
                     f"{self.target}: the effect {corruption.effect.value} needs a whole message as "
                     "its target, got a field"
+                )
+            if replace(self, bits=1, field="any", exact_bits=None, together=False) != self:
+                raise FaultSpecError(
+                    f"{self.target}: the effect {corruption.effect.value} strikes a whole message, "
+                    "so it takes no bits, field or components"
                 )
             return fields, None
         require_effect(self.target, corruption.effect, (*OF_VALUES, *OF_MESSAGES))
@@ -247,7 +257,7 @@ class FaultConfig:
         when = named_member(When, "trigger", kind)
         if when in (When.RANDOM, When.FORESEEN):
             return Trigger(when=when)
-        if when is When.PHASE and (self.wire_target or value.isupper()):
+        if when is When.PHASE and (self.wire_target or not value.islower()):
             return Trigger(when=when, phase=value)  # flight mode of the autopilot
         if when is When.PHASE:
             return Trigger(when=when, phase=named_member(PilotMode, "phase", value).value)
@@ -422,8 +432,14 @@ class InstructionConfig:
 
         Raises:
             UnknownName: No program has this name.
-            FaultSpecError: A process cannot have this trigger.
+            FaultSpecError: A process cannot have this trigger, or the executable is not a file
+                name.
         """
+        name = self.executable
+        if name is not None and ("/" in name or not name.isprintable()):
+            raise FaultSpecError(
+                f"{self.target}: give the file name of the executable without its folder"
+            )
         self.moment().check_program(programs)
 
     def describe(self, struck: str | None = None) -> str:

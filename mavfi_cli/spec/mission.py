@@ -13,7 +13,8 @@ import numpy as np
 from mavfi_cli.autonomy import canonical_planner
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.core.frames import norm
-from mavfi_cli.core.types import KERNELS, Briefing, FloatArray
+from mavfi_cli.core.types import KERNELS, Briefing, FloatArray, Stage
+from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.platform import PlatformProfile
@@ -213,6 +214,16 @@ class MissionConfig:
         for name in ("link", "realtime", "isolate", "land"):
             if getattr(self, name):
                 raise ConfigError("cannot be combined with --companion", key=name)
+        if self.detector is not None:
+            usual = DetectorConfig(name=self.detector.name)
+            for name in ("alarms_max", "watch"):
+                if getattr(self.detector, name) != getattr(usual, name):
+                    raise ConfigError("has no effect on the gate of a user's companion", key=name)
+            if set(self.detector.protect) <= {Stage.PERCEPTION.value}:
+                raise ConfigError(
+                    "must name planning (the vehicle's state) or control (the setpoint) for the "
+                    "gate of a user's companion", key="protect",
+                )  # fmt: skip
         plain = MissionConfig()
         for name in OF_THE_COMPANION:
             if getattr(self, name) != getattr(plain, name):
@@ -241,7 +252,7 @@ class MissionConfig:
         if self.link is not None:
             raise ConfigError(_NOT_WITH_LINK, key="autopilot")
         repeats = self.autopilot in _REPEATING and not self.realtime
-        if self.instruction is not None and not repeats:
+        if self.instruction is not None and self.companion is None and not repeats:
             paced = " with --realtime" if self.realtime else ""
             raise ConfigError(
                 f"{self.autopilot}{paced} cannot be combined with --level instruction, because its "
@@ -304,8 +315,11 @@ class MissionConfig:
         stack = self.stack.partition(":")[0]  # without the differences of a variant
         named = (self.world, self.platform, stack, self.vehicle)
         files = tuple(name for name in named if name.endswith(".toml"))
-        companion = self.companion if (self.companion or "").endswith(".toml") else None
-        return files + tuple(name for name in (model, self.firmware, companion) if name)
+        files += tuple(name for name in (model, self.firmware) if name)
+        if self.companion is None:
+            return files
+        own = (self.companion,) if CompanionConfig.is_file(self.companion) else ()
+        return files + own + CompanionConfig.load(self.companion, starts=False).files
 
     def loaded_stack(self) -> Stack:
         """Load the mission's stack. The mission's goal tolerance, if set, replaces the stack's.

@@ -22,6 +22,7 @@ from mavfi_cli.mission.companion_faults import (
 )
 from mavfi_cli.mission.programs import Programs, Throttle
 from mavfi_cli.report.summary import summary_lines
+from mavfi_cli.spec.companion import CompanionConfig, ProgramConfig
 from mavfi_cli.spec.fault import FaultConfig
 
 HOP = Path(__file__).with_name("hop.py")
@@ -115,7 +116,7 @@ def test_a_swapped_message_follows_the_next_of_its_own_side():
 
 
 def test_a_program_that_does_not_run_is_not_struck(tmp_path):
-    fault = CompanionInjection(FaultConfig(target="process.hop", at="time=0"), {"hop": None})
+    fault = CompanionInjection(FaultConfig(target="process.hop", at="time=0"))
     fault.aim_at(1.0)
     fault.begin(tmp_path / "fault.json")
     fault.tick(at(0.0))
@@ -156,11 +157,20 @@ def test_direction_and_components():
         (SETPOINT, {"at": "foreseen"}, FaultSpecError, "foreseen"),
         ("process.hop", {"effect": "zero"}, FaultSpecError, "got zero"),
         ("process.hop", {"effect": "slow=2"}, FaultSpecError, "at most 1"),
+        ("process.hop", {"duration_s": 2.0}, FaultSpecError, "stop and slow a duration"),
+        ("process.hop", {"exact_bits": (3,)}, FaultSpecError, "stop and slow a duration"),
+        ("process.hop", {"persistence": "stuck-at"}, FaultSpecError, "stop and slow a duration"),
+        (SETPOINT, {"effect": "drop", "together": True}, FaultSpecError, "takes no bits"),
+        (SETPOINT, {"at": "phase=OFBOARD"}, UnknownName, "did you mean 'OFFBOARD'"),
+        ("process.hop", {"at": "phase=offboard"}, UnknownName, "did you mean 'OFFBOARD'"),
+        ("process.hop", {"at": "phase="}, UnknownName, "flight mode"),
+        ("process.hop", {"at": "time=21"}, FaultSpecError, "time limit of 20 s"),
     ],
 )
 def test_faults_that_a_companion_cannot_have(target, settings, error, problem):
+    hop = CompanionConfig(program={"hop": ProgramConfig(command="true")}, time_limit_s=20.0)
     with pytest.raises(error, match=problem.replace(".", "\\.")):
-        check_companion_fault(FaultConfig(target=target, **settings), {"hop": None})
+        check_companion_fault(FaultConfig(target=target, **settings), hop)
 
 
 @pytest.mark.parametrize("share", [0.5, 1.0])
@@ -184,8 +194,7 @@ def test_a_stopped_program_does_not_run_and_goes_on(tmp_path, share):
         if share < 1.0:
             program.throttle = Throttle(program, share)
         fault = CompanionInjection(
-            FaultConfig(target="process.busy", at="time=0", effect="stop", duration_s=5.0),
-            {"busy": None},
+            FaultConfig(target="process.busy", at="time=0", effect="stop", duration_s=5.0)
         )
         fault.running = {"busy": program}
         fault.aim_at(1.0)
@@ -261,6 +270,10 @@ def test_an_instruction_of_a_program_is_struck_in_flight_and_struck_again(tmp_pa
     [
         (["--level", "instruction", "--inject", "hopp"], "did you mean 'hop'"),
         (["--level", "instruction", "--inject", "hop", "--at", "foreseen"], "got foreseen"),
+        (["--level", "instruction", "--inject", "hop//bin/true"], "without its folder"),
+        (["--golden", "2", "--expect", "success"], "--expect has no effect with --golden"),
+        (["--detector", "gad", "--watch", "extended"], "no effect on the gate"),
+        (["--detector", "gad", "--protect", "perception"], "must name planning"),
         (["--level", "instruction", "--inject", "hop", "--at", "time=400"], "time limit of 300 s"),
         (["--inject", "process.hop", "--scope", "libc.so.6"], "--level instruction"),
         (["--replay", ".", "--inject", "hop"], "--replay"),
@@ -285,5 +298,3 @@ def test_settings_of_a_program_need_a_users_companion(tmp_path, mavfi, option):
 def test_a_message_needs_a_users_companion(tmp_path):
     with pytest.raises(MavfiError, match="needs --companion"):
         library.fly(fault=FaultConfig(target="LOCAL_POSITION_NED.z"), out=tmp_path)
-    with pytest.raises(UnknownName, match="no_such"):
-        CompanionInjection(FaultConfig(target="process.no_such"), {})

@@ -13,7 +13,7 @@ from mavfi_cli import library
 from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.core.errors import ConfigError, MavfiError, RecordError, UnknownName
+from mavfi_cli.core.errors import ConfigError, MavfiError, RecordError
 from mavfi_cli.core.flight_record import ProgramEnds
 from mavfi_cli.core.processes import fork, leave_network
 from mavfi_cli.link.codec import Codec
@@ -107,6 +107,12 @@ def test_the_end_of_a_program_is_seen_while_the_vehicle_lands(fly):
 
 
 @pytest.mark.slow
+def test_a_vehicle_that_stands_near_the_goal_has_not_reached_it(fly):
+    run = fly("waits", success="goal_m = 50.0", limit_s=3.0, goal=(10.0, 6.0, 5.0))
+    assert run.record.outcome == "timeout"
+
+
+@pytest.mark.slow
 def test_a_corridor_around_the_golden_path(fly):
     golden = fly("lands")
     near = f"landed = true\ncorridor_m = 3.0\ngolden = '{golden.folder.path}'"
@@ -127,6 +133,20 @@ def test_a_corridor_around_the_golden_path(fly):
         ("[program.a]\ncommand = 'true'\nrestart = 'allways'", ConfigError, "always"),
         ("[program.a]\ncommand = 'true'\nfolder = 'none'", ConfigError, "no such folder"),
         ("[program.a]\ncommand = 'true'\nready_line = '('", ConfigError, "be a regular expression"),
+        ("[program.a]\ncommand = 'true'\nready_line = '\\u00e9'", ConfigError, "bad escape"),
+        ("[program.a]\ncommand = 'true'\nready_port = 70000", ConfigError, "1 and 65535, got"),
+        ('[program.a]\ncommand = "true\\u0000"', ConfigError, "must not contain NUL"),
+        ("[program.a]\ncommand = 'true'\nenvironment = {'' = '1'}", ConfigError, "the variable ''"),
+        ("[program.a]\ncommand = 'true {lnk}'", ConfigError, "did you mean 'link'"),
+        ("[program.a]\ncommand = 'true'\nrestart = 'always'", ConfigError, "always restarts"),
+        ("key_file = 'none'\n[program.a]\ncommand = 'true'", ConfigError, "read the passphrase"),
+        ("link = 'foo'\n[program.a]\ncommand = 'true'", ConfigError, "link"),
+        ("link = 'udpin:0.0.0.0:1'\n[program.a]\ncommand = 'true'", ConfigError, "on 127.0.0.1"),
+        ("link = 'tcp:127.0.0.1:1'\n[program.a]\ncommand = 'true'", ConfigError, "or tcpin:"),
+        ("flight_s = 9.0\ntime_limit_s = 8.0\n[program.a]\ncommand = 'true'", ConfigError,
+         "at most time_limit_s"),
+        (f"a = {'9' * 5000}", ConfigError, "too many digits"),
+        (f"a = {'[' * 9000}", ConfigError, "nested too deeply"),
         ("[program.a]\ncommand = 'true'\n[success]\nexit = 'b'", ConfigError, "unknown program"),
         ("[program.a]\ncommand = 'true'\n[success]\ncorridor_m = 1", ConfigError, "golden"),
         ("link = 'udpin:127.0.0.1:0'\n[program]", ConfigError, "at least one program"),
@@ -189,13 +209,34 @@ def test_the_vehicle_makes_a_depth_socket_for_a_companion_that_uses_it():
     assert not CompanionConfig(program={"a": programs["a"]}).uses("depth")
 
 
-def test_a_misspelled_placeholder_names_the_nearest():
-    program = CompanionConfig.load("true {gaol}").program["companion"]
-    with pytest.raises(UnknownName, match="did you mean 'goal'"):
-        program.argv({"goal": "1,2,3", "link": "udpout:127.0.0.1:1"})
-    assert CompanionConfig.load("true {goal} '{\"a\": 1}'").program["companion"].argv(
-        {"goal": "1,2,3"}
-    ) == ["true", "1,2,3", '{"a": 1}']
+def test_placeholders_and_text_in_braces():
+    with pytest.raises(ConfigError, match=r"did you mean 'goal'.*write {{gaol}}"):
+        CompanionConfig.load("true {gaol}")
+    program = CompanionConfig.load("true {goal} {{goal}} '{\"a\": 1}'").program["companion"]
+    assert program.argv({"goal": "1,2,3"}) == ["true", "1,2,3", "{goal}", '{"a": 1}']
+
+
+def test_a_command_line_may_end_in_toml_and_names_the_files_that_it_depends_on(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    for name in ("fly.py", "settings.toml", "my hop.toml"):
+        Path(name).write_text("[program.a]\ncommand = 'true'\n")
+    given = "python fly.py settings.toml {link}"
+    assert CompanionConfig.load(given).files == ("fly.py", "settings.toml")
+    assert MissionConfig(companion=given).files == ("fly.py", "settings.toml")
+    assert MissionConfig(companion="my hop.toml").files == ("my hop.toml",)
+    with pytest.raises(ConfigError, match="No such file"):
+        CompanionConfig.load("hopp.toml")
+
+
+def test_the_golden_folder_lies_beside_the_companions_file(tmp_path):
+    path = tmp_path / "hop.toml"
+    path.write_text(
+        "[program.a]\ncommand = 'true'\n[success]\ncorridor_m = 1\ngolden = 'golden/farm-3-001'"
+    )
+    golden = CompanionConfig.load(str(path)).success.golden
+    assert golden == str(tmp_path / "golden" / "farm-3-001")
 
 
 @pytest.mark.parametrize(

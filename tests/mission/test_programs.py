@@ -58,6 +58,15 @@ def test_a_line_tells_readiness_before_the_end(start):
     assert program.codes == []
 
 
+@pytest.mark.parametrize("environment", [{}, {"PYTHONUNBUFFERED": ""}])
+def test_a_python_programs_output_is_not_buffered(start, monkeypatch, environment):
+    monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)
+    end = "import os; os.kill(os.getpid(), 9)"
+    program = start(f"print('ready'); {end}", environment=environment, ready_line="ready")
+    awaited(program, lambda: program.codes)
+    assert program.ready == (not environment)
+
+
 @pytest.mark.parametrize(
     ("rule", "code", "starts"), [("on-failure", 0, 1), ("never", 1, 1), ("on-failure", 1, 4)]
 )

@@ -42,7 +42,7 @@ def struck(monkeypatch, tmp_path, pid, executable):
     monkeypatch.setattr(companion, "attack_moment", lambda *_, **__: None)
     program, usual_s = SimpleNamespace(pid=pid, codes=[]), sys.getswitchinterval()
     request = InstructionConfig(target=f"fly{executable}", at="time=1", seed=1)
-    injection = ProcessInjection(request, {"fly": None}, None)
+    injection = ProcessInjection(request, None)
     injection.running = {"fly": program}
     injection.aim_at(10.0)
     injection.begin(tmp_path / "fault.json")

@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,20 +39,12 @@ class ProcessInjection(CompanionFault):
     """Injection of one instruction-level fault into a running program, by a tracer thread.
 
     Args:
-        request: The fault.
-        programs: The companion's programs by name.
+        request: A fault that `check_companion_fault` accepts.
         repeat: Record of a fault whose instruction is to be struck again; None to draw one.
-
-    Raises:
-        UnknownName: The companion has no program with the name in `request`.
-        FaultError: Settings of the fault contradict each other.
     """
 
-    def __init__(
-        self, request: InstructionConfig, programs: Mapping[str, Any], repeat: FaultRecord | None
-    ) -> None:
+    def __init__(self, request: InstructionConfig, repeat: FaultRecord | None) -> None:
         super().__init__()
-        request.check_program(programs)
         self._request, self._strategy, self._repeat = request, mission_strategy(request), repeat
         self._path: Path | None = None
         self._tracer: TracerThread[LiveAttack] | None = None
