@@ -168,6 +168,9 @@ class Reaction:
     setpoint_stamp_s: float
 
 
+_COMPANION = "companion:"  # prefix of a companion's name in a mark
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StackMark:
     """The identity of a stack, or of a user's companion, to which a detector model belongs.
@@ -180,6 +183,16 @@ class StackMark:
 
     name: str
     digest: str
+
+    @classmethod
+    def of_companion(cls, name: str, digest: str) -> StackMark:
+        """Make the mark of a user's companion, whose name no stack can have."""
+        return cls(name=f"{_COMPANION}{name}", digest=digest)
+
+    @property
+    def is_companion(self) -> bool:
+        """True if the mark is that of a user's companion."""
+        return self.name.startswith(_COMPANION)
 
 
 Message = CollisionReport | Trajectory | Command

@@ -19,7 +19,6 @@ from mavfi_cli.core.config import load_toml
 from mavfi_cli.core.errors import ConfigError, LinkError, UnknownName
 from mavfi_cli.core.types import StackMark
 from mavfi_cli.link.endpoint import parse_endpoint
-from mavfi_cli.spec.detector import COMPANION
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -322,7 +321,7 @@ class CompanionConfig:
         """
         commands = {name: program.command for name, program in self.program.items()}
         digest = hashlib.sha256(json.dumps(commands).encode()).hexdigest()
-        return StackMark(name=f"{COMPANION}{self.name or 'companion'}", digest=digest)
+        return StackMark.of_companion(self.name or "companion", digest)
 
     def uses(self, placeholder: str) -> bool:
         """Return True if the command of any program contains `placeholder` in braces."""

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 STAGES = tuple(stage.value for stage in Stage)
 PAPER, EXTENDED = "paper", "extended"  # sets of watched states
 WATCHES = (PAPER, EXTENDED)
-COMPANION = "companion:"
-"""Prefix of the stack name in a model that was fitted to a user's companion."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -167,7 +165,7 @@ class DetectorConfig:
         if path is None:
             problem = f"{self.name} needs --model, a model fitted to the companion; {fit}"
             raise ModelError(problem).as_usage()
-        if not made_for.name.startswith(COMPANION):
+        if not made_for.is_companion:
             raise ModelError(
                 f"this model was fitted to the stack {made_for.name!r}, not to a companion; {fit}",
                 path=path,

@@ -25,7 +25,6 @@ from mavfi_cli.detect.offline import Dataset
 from mavfi_cli.detect.preprocess import PreprocessParams
 from mavfi_cli.mission.setpoints import samples_of_tlog
 from mavfi_cli.spec.companion import CompanionConfig
-from mavfi_cli.spec.detector import COMPANION
 from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
 from mavfi_cli.spec.stack import load_stack
 
@@ -133,5 +132,5 @@ def _mark_of(plan: TrainingPlan) -> StackMark:
     if plan.base.companion is not None:
         return CompanionConfig.load(plan.base.companion).mark
     if plan.logs:
-        return StackMark(name=f"{COMPANION}logs", digest="")
+        return StackMark.of_companion("logs", "")
     return load_stack(plan.base.stack).mark
