@@ -4,8 +4,8 @@ r"""Counts the flights of a user's companion that faults lose, with and without 
 
 Reads exports of campaigns (`mavfi campaign export`) with golden flights, null faults and faults in
 instructions. A fault struck if the record has its activation. It is dead if its process ended, and
-silent otherwise. A flight is lost if it does not end in success. Intervals are Wilson's, 95 %; p is
-that of Fisher's exact test.
+silent if it was read and its process did not end. A flight is lost if it does not end in success.
+Intervals are Wilson's, 95 %; p is that of Fisher's exact test.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def main() -> None:
     _compare("dead", [[*map(_dead, side)] for side in struck], counts=True)
     for name, kind in (("dead", _dead), ("silent", _silent)):
         _compare(f"lost, of the {name}", [[*map(lost, filter(kind, side))] for side in struck])
-    overwritten = [[row["activation"] == "overwritten" for row in side] for side in struck]
-    _compare("overwritten", overwritten, counts=True)
+    overwritten = [[row for row in side if row["activation"] == "overwritten"] for side in struck]
+    _compare("lost, of the overwritten", [[*map(lost, side)] for side in overwritten])
     alarmed = [row for row in struck[1] if row["alarm_count"]]
     print(f"\nAlarms in {len(alarmed)} of {len(struck[1])} struck flights with the gate, ", end="")
     print(f"of which {sum(map(lost, alarmed))} were lost.")
@@ -48,7 +48,7 @@ def _dead(row: Row) -> bool:
 
 
 def _silent(row: Row) -> bool:
-    return not row["node_ended"]
+    return row["activation"] == "read" and not row["node_ended"]
 
 
 def _alarms(rows: list[Row]) -> str:

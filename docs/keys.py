@@ -41,22 +41,29 @@ def default(field):
 
 
 class Keys(SphinxDirective):
-    """The fields of a dataclass: name, type, default and meaning."""
+    """The fields of a dataclass: name, type, limits if the module has them, default and meaning."""
 
     required_arguments = 1
 
     def run(self):
         """Return the table."""
         module, _, name = self.arguments[0].partition(":")
-        cls = getattr(importlib.import_module(module), name)
+        code = importlib.import_module(module)
+        cls = getattr(code, name)
         meanings = attributes(cls.__doc__) | comments(cls)
+        limits = getattr(code, "LIMITS", {})
         rows = [
-            f"| `{field.name}` | {kind(field.type)} | {default(field)} "
-            f"| {meanings.get(field.name, '')} |"
+            f"| `{field.name}` | {kind(field.type)}{between(limits.get(field.name))} "
+            f"| {default(field)} | {meanings.get(field.name, '')} |"
             for field in dataclasses.fields(cls)
         ]
         text = "\n".join(["| key | type | default | meaning |", "|---|---|---|---|", *rows])
         return self.parse_text_to_nodes(text)
+
+
+def between(limits):
+    """The smallest and the largest number, in words; empty without limits."""
+    return "" if limits is None else f", {limits[0]:.10g} to {limits[1]:.10g}"
 
 
 def kind(annotation):
