@@ -1,0 +1,84 @@
+r"""Applies the rule of docs/results/replica-table4.toml to its missions, all faults counted.
+
+    python benchmarks/table4_rule.py docs/results/replica-table4-part*.parquet
+
+Reads exports of campaigns (`mavfi campaign export`). Prints two tables, with McNemar's exact test
+corrected by Holm: in each world, faults against the golden flights of the same seeds under both
+restart rules, and each detector against no protection on the same faults, of which the second table
+has those whose golden flight succeeds. Its last rows pool the worlds, which is not part of the
+rule, and are not corrected. Intervals are Wilson's, 95 %.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from exported import PAIRED, Key, Row, against, arguments, flown, golden_lost, key, lost, share
+
+from mavfi_cli.stats.paired import McNemar, holm
+
+FAULT = (*PAIRED, "fault_target", "fault_seed")
+
+
+def compared(cells: Mapping[tuple[str, ...], McNemar]) -> list[tuple[str, McNemar, float]]:
+    """Return the name, the test of *lost* and the corrected p-value of each cell."""
+    corrected = holm([test.p_value for test in cells.values()])
+    return [
+        (" | ".join(name), test, p)
+        for (name, test), p in zip(cells.items(), corrected, strict=True)
+    ]
+
+
+def arm(rows: list[Row], *, world: str, detector: str, restart_s: float) -> dict[Key, bool]:
+    """Return which faults of one world lose the mission in one arm; an empty world means all."""
+    return {
+        key(row, FAULT): lost(row)
+        for row in rows
+        if row["world"].startswith(world)
+        and (row["detector"] or "") == detector
+        and row["label_node_restart_s"] == restart_s
+    }
+
+
+def main() -> None:
+    """Read the exports, and print both tables."""
+    rows = flown(arguments(__doc__).parse_args().parts)
+    golden = golden_lost(rows)
+    faults = [row for row in rows if row["level"] == "instruction" and key(row, PAIRED) in golden]
+    worlds = sorted({row["world"] for row in faults})
+    losses = {
+        (world, f"{restart_s:g} s"): against(
+            {fault: golden[fault[: len(PAIRED)]] for fault in plain}, plain
+        )
+        for restart_s in (1.0, 3600.0)
+        for world in worlds
+        if (plain := arm(faults, world=world, detector="", restart_s=restart_s))
+    }
+    print("| world | dead nodes back after | lost with the fault only | golden only | p |")
+    print("|---|---|---|---|---|")
+    for name, test, p in compared(losses):
+        print(f"| {name} | {test.only_second} | {test.only_first} | {p:.1g} |")
+
+    healthy = [row for row in faults if not golden[key(row, PAIRED)]]
+    print(
+        "\n| world | detector | saved, of the lost | lost with it only | p |\n|---|---|---|---|---|"
+    )
+    pairs = {
+        (world or "all", detector): tuple(
+            arm(healthy, world=world, detector=each, restart_s=1.0) for each in ("", detector)
+        )
+        for world in (*worlds, "")
+        for detector in ("gad", "aad")
+    }
+    tests = {name: against(plain, guarded) for name, (plain, guarded) in pairs.items()}
+    ruled = compared({name: test for name, test in tests.items() if name[0] != "all"})
+    pooled = [
+        (" | ".join(name), tests[name], tests[name].p_value) for name in tests if name[0] == "all"
+    ]
+    for name, test, p in ruled + pooled:
+        of_lost = share(test.only_first, test.only_first + test.both)
+        print(f"| {name} | {of_lost} | {test.only_second} | {p:.2g} |")
+
+
+if __name__ == "__main__":
+    main()
