@@ -20,7 +20,7 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @click.command(cls=GroupedCommand)
 @_link("--link", metavar="URL", default="udpin:127.0.0.1:14540",
        help="Link to the vehicle: udpin:, udpout:, tcp:, tcpin:, serial:.")  # fmt: skip
-@_link("--goal", metavar="X,Y,Z", type=types.PLACE, help="Goal in real time, ENU, m.")
+@_link("--goal", metavar="X,Y,Z", type=types.PLACE, help="Goal of a flight in real time, ENU, m.")
 @_link("--lockstep", "briefing", metavar="FILE", type=_FILE,
        help="Fly in lockstep, with start, goal, bounds and camera of this briefing.")  # fmt: skip
 @_mission("--config", metavar="FILE", type=_FILE,

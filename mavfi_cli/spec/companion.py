@@ -257,7 +257,7 @@ class CompanionConfig:
         if self.success.exit is not None and self.success.exit not in self.program:
             raise UnknownName("program", self.success.exit, self.program)
         if self.time not in TIMES:
-            raise UnknownName("time", self.time, TIMES)
+            raise ConfigError(f"must be 'wall' or 'lockstep', got {self.time!r}", key="time")
         if self.link is None:
             object.__setattr__(self, "link", _ANY_PORT[self.time])
         self._check_link()
