@@ -4,8 +4,8 @@ r"""Applies the rule of docs/results/replica-table4.toml to its missions, all fa
 
 Reads exports of campaigns (`mavfi campaign export`). Prints two tables, with McNemar's exact test
 corrected by Holm: in each world, faults against the golden flights of the same seeds under both
-restart rules, and each detector against no protection on the same faults, of which the second table
-has those whose golden flight succeeds. Its last rows pool the worlds, which is not part of the
+restart rules, and each detector against no protection on the same faults. The second table counts
+only faults whose golden flight succeeds. Its last rows pool the worlds, which is not part of the
 rule, and are not corrected. Intervals are Wilson's, 95 %.
 """
 
@@ -65,7 +65,7 @@ def main() -> None:
     )
     pairs = {
         (world or "all", detector): tuple(
-            arm(healthy, world=world, detector=each, restart_s=1.0) for each in ("", detector)
+            arm(healthy, world=world, detector=name, restart_s=1.0) for name in ("", detector)
         )
         for world in (*worlds, "")
         for detector in ("gad", "aad")

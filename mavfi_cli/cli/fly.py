@@ -40,6 +40,7 @@ _LARGE = [
     "--inject", "waypoint_position", "--all-components", "--field", "exponent",
     "--fault-seed", "20",
 ]  # fmt: skip
+_TOO_SHORT = "the mission ended before"  # reason of a fault whose time came too late
 _OUTCOMES = ["success", "collision", "no_path", "timeout", "failsafe", "link_lost", "crash", "hang"]
 
 
@@ -264,7 +265,7 @@ def _hint(run: Run) -> list[str]:
     record = run.record
     fault = record.state_fault or record.instruction_fault
     drawn = (record.config["fault"] or record.config["instruction"] or {}).get("at") == "random"
-    if fault is not None and fault.state == "not_injected" and drawn and record.programs:
+    if fault is not None and fault.reason.startswith(_TOO_SHORT) and drawn and record.programs:
         return [
             "",
             "A random time may fall after the end of the flight; set flight_s in the companion's "

@@ -30,7 +30,7 @@ TARGET = "x86-64-v3"
 """Level of x86-64 that kernels are compiled for."""
 
 
-def compiled(function: F) -> F:
+def compiled(function: F, *, releases_gil: bool = False) -> F:
     """Return a version of `function` that numba compiles when it is first called.
 
     The machine code is cached on disk. It uses IEEE arithmetic without reordering, and no threads.
@@ -38,9 +38,12 @@ def compiled(function: F) -> F:
     numba's cache checks the source file of a function, but not the files of the functions that
     were compiled into it. Here the stamp of a cache entry covers all sources in the folder of the
     function and in those of all compiled functions that it can reach. Outdated code is never run.
+
+    Args:
+        releases_gil: Let other threads run Python code during a call from Python.
     """
     numba = _numba()
-    dispatcher = numba.njit(cache=True, error_model="numpy")(function)
+    dispatcher = numba.njit(cache=True, error_model="numpy", nogil=releases_gil)(function)
     cache = getattr(dispatcher, "_cache", None)
     cache_file = getattr(cache, "_cache_file", None)
     if cache_file is not None:

@@ -1,7 +1,7 @@
 """The numeric fields of MAVLink messages as states that a fault can strike.
 
 A state is named MESSAGE.FIELD, or MESSAGE.FIELD[INDEX] for an element of an array. The elements of
-an array form a group, and so do three fields whose names differ only in a final x, y or z.
+an array form a group, and so do fields whose names differ only in a final x, y or z.
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ class WireFields:
             unit = getattr(kind, "fieldunits_by_name", {}).get(field, "1")
             dtype = _TYPES.get(wire) or DType(wire.removesuffix("_t"))
             triple = {f"{field[:-1]}{axis}" for axis in "xyz"}
-            shared = f"{field[:-1]}*" if triple <= {*kind.fieldnames} and field in triple else field
+            together = field in triple and len(triple & {*kind.fieldnames}) > 1
+            shared = f"{field[:-1]}*" if together else field
             count = counts[field]
             for column in [None] if count == 1 else range(count):
                 full = f"{name}.{field}" + ("" if column is None else f"[{column}]")

@@ -558,6 +558,7 @@ class _Verdict:
         assert self.goal_enu_m is not None
         if (
             near_m is None
+            or not self.flew
             or norm(state.position_enu_m - self.goal_enu_m) > near_m
             or norm(state.velocity_enu_mps) > _REST_MPS
         ):
@@ -590,7 +591,7 @@ class _Verdict:
         """
         success = self._success
         ends = (
-            *([self._rests and self.flew] if success.goal_m is not None else ()),
+            *([self._rests] if success.goal_m is not None else ()),
             *([self.landed] if success.landed else ()),
             *([self._crew.succeeded(success.exit)] if success.exit is not None else ()),
         )

@@ -49,9 +49,6 @@ class Crew:
 
         Args:
             values: Value of each placeholder, by its name.
-
-        Raises:
-            UnknownName: A command contains an unknown placeholder.
         """
         self._programs = programs
         self._tasks = {name: _task(program, values) for name, program in self._waiting}

@@ -407,6 +407,8 @@ class Run:
             why = COMPANION_VARIES
         elif PlatformProfile.factor_of(record.config.get("platform", "")) is not None:
             why = "a flight on measured kernel times is not repeatable"
+        if why:
+            raise RecordError(f"{path}: {why}")
         config = structure(dict(record.config), MissionConfig, path=self.folder.result)
         with reading(self.folder.result):
             for name, digest in {**dict.fromkeys(config.files, ""), **record.files}.items():

@@ -11,17 +11,13 @@ import shlex
 import shutil
 import stat
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mavfi_cli.core.config import load_toml
 from mavfi_cli.core.errors import ConfigError, LinkError, UnknownName
 from mavfi_cli.core.types import StackMark
 from mavfi_cli.link.endpoint import parse_endpoint
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 RESTARTS = ("never", "on-failure", "always")
 ACTIONS, ON_ERROR = ("hold", "brake", "autopilot"), ("open", "closed")
@@ -30,7 +26,8 @@ _ANY_PORT = {"wall": "udpin:127.0.0.1:0", "lockstep": "tcpin:127.0.0.1:0"}
 PLACEHOLDERS = (
     "link", "mavsdk", "port", "free", "briefing", "depth", "world", "start", "goal", "seed",
 )  # fmt: skip
-_PLACEHOLDER = re.compile(r"\{\{(\w+)\}\}|\{(\w+)\}")  # {{word}} stands for the text {word}
+# {{word}} stands for the text {word}; ${word} is a variable of a shell.
+_PLACEHOLDER = re.compile(r"\{\{([a-z]+)\}\}|(?<!\$)\{([a-z]+)\}")
 _LONGEST_S = 3600.0
 LIMITS = {  # minimum and maximum of each number
     "restart_s": (0.0, _LONGEST_S),
@@ -47,13 +44,11 @@ LIMITS = {  # minimum and maximum of each number
 }
 
 
-def _require_limits(config: DataclassInstance) -> None:
-    for own in fields(config):
-        low, high = LIMITS.get(own.name, (-math.inf, math.inf))
-        value = getattr(config, own.name)
-        if own.name in LIMITS and value is not None and not low <= value <= high:
-            got = "a larger number" if value > high else f"{value:g}"
-            raise ConfigError(f"must be between {low:g} and {high:g}, got {got}", key=own.name)
+def _require_limits(config: object) -> None:
+    for name, (low, high) in LIMITS.items():
+        value = getattr(config, name, None)
+        if value is not None and not low <= value <= high:
+            raise ConfigError(f"must be between {low:g} and {high:g}", key=name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,7 +222,7 @@ class CompanionConfig:
         own_network: In a campaign, each mission has a network of its own with only a loopback, if
             the operating system allows it, so that fixed ports do not collide.
         camera_heartbeat: The camera component sends heartbeats. MAVProxy and DroneKit mistake them
-            for those of a second vehicle.
+            for those of a vehicle.
     """
 
     program: dict[str, ProgramConfig]
@@ -279,7 +274,8 @@ class CompanionConfig:
             end = parse_endpoint(self.url)
         except LinkError as error:
             raise ConfigError(str(error), key="link") from None
-        if end.scheme not in ("udpin", "udpout", "tcpin") or end.host != "127.0.0.1":
+        known = end.scheme in ("udpin", "udpout", "tcpin")
+        if not known or end.host not in ("127.0.0.1", "localhost"):
             raise ConfigError(
                 f"must be udpin:, udpout: or tcpin: on 127.0.0.1, got {self.url}", key="link"
             )
@@ -329,34 +325,32 @@ class CompanionConfig:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Paths of the scripts and other files that the commands name, except those on PATH."""
-        named = [
-            Path(program.folder) / word
-            for program in self.program.values()
-            for word in _words(program.command)
-        ]
-        here = Path.cwd()
-        places = (
-            place.relative_to(here) if place.is_relative_to(here) else place for place in named
-        )
-        return tuple(dict.fromkeys(str(place) for place in places if place.is_file()))
+        """Path of the binary or of the Python script that each command runs, if not on PATH."""
+        here, found = Path.cwd(), []
+        for program in self.program.values():
+            words = _words(program.command)
+            words = words[Path(words[0]).name.startswith("python") :]
+            places = (Path(program.folder) / word for word in words)
+            if (place := next(filter(os.path.isfile, places), None)) is not None:
+                found.append(place.relative_to(here) if place.is_relative_to(here) else place)
+        return tuple(dict.fromkeys(map(str, found)))
 
     @staticmethod
     def is_file(given: str) -> bool:
         """Return True if `--companion` names a TOML file, and False if it is a command line."""
         path = Path(given)
-        return path.suffix == ".toml" and (path.is_file() or len(given.split()) == 1)
+        return path.suffix == ".toml" and (os.path.isfile(given) or len(given.split()) == 1)
 
     @classmethod
     def load(cls, given: str, *, starts: bool = True) -> CompanionConfig:
         """Load a companion from the TOML file `given`, or build one that runs `given` as a command.
 
         Args:
-            starts: Also check that its programs can be started on this machine.
+            starts: Also check that its programs can be started on this machine, and that the file
+                of its passphrase can be read.
 
         Raises:
-            ConfigError: The file or the file of its passphrase cannot be used, or a program cannot
-                be started.
+            ConfigError: The file cannot be used, or a check has failed.
             UnknownName: A name in the file does not exist.
         """
         path = Path(given)
@@ -370,14 +364,14 @@ class CompanionConfig:
             name: replace(program, folder=str(base / program.folder))
             for name, program in loaded.program.items()
         }
+        key_file = None if loaded.key_file is None else str(base / loaded.key_file)
         if starts:
             for name, program in placed.items():
                 _require_startable(name, program)
-        key_file = None if loaded.key_file is None else str(base / loaded.key_file)
-        if key_file is not None:
-            from mavfi_cli.link.transport import signing_from_file  # loads pymavlink
+            if key_file is not None:
+                from mavfi_cli.link.transport import signing_from_file  # loads pymavlink
 
-            signing_from_file(key_file)
+                signing_from_file(key_file)
         success, golden = loaded.success, loaded.success.golden
         if golden is not None:
             success = replace(success, golden=str(base / golden))

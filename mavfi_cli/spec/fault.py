@@ -257,7 +257,7 @@ class FaultConfig:
         when = named_member(When, "trigger", kind)
         if when in (When.RANDOM, When.FORESEEN):
             return Trigger(when=when)
-        if when is When.PHASE and (self.wire_target or not value.islower()):
+        if when is When.PHASE and (self.wire_target or value.isupper()):
             return Trigger(when=when, phase=value)  # flight mode of the autopilot
         if when is When.PHASE:
             return Trigger(when=when, phase=named_member(PilotMode, "phase", value).value)
@@ -435,8 +435,8 @@ class InstructionConfig:
             FaultSpecError: A process cannot have this trigger, or the executable is not a file
                 name.
         """
-        name = self.executable
-        if name is not None and ("/" in name or not name.isprintable()):
+        _, slash, name = self.target.partition("/")
+        if slash and (not name or "/" in name or not name.isprintable()):
             raise FaultSpecError(
                 f"{self.target}: give the file name of the executable without its folder"
             )

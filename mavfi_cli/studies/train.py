@@ -130,7 +130,7 @@ def _mark_of(plan: TrainingPlan) -> StackMark:
     The models store this identity.
     """
     if plan.base.companion is not None:
-        return CompanionConfig.load(plan.base.companion).mark
+        return CompanionConfig.load(plan.base.companion, starts=not plan.logs).mark
     if plan.logs:
         return StackMark.of_companion("logs", "")
     return load_stack(plan.base.stack).mark

@@ -84,7 +84,7 @@ def _resume(tid: int, group: int, request: int, report: NDArray[np.int32]) -> bo
     return bool(report[0] == tid and report[1] == _STOPPED_BY_STEP)
 
 
-@compiled
+@functools.partial(compiled, releases_gil=True)  # a step may wait for the target
 def _run(
     tid: int,
     group: int,
@@ -205,7 +205,7 @@ def _executed(ip: int, members: NDArray[np.int64]) -> int:
     return len(members)
 
 
-@compiled
+@functools.partial(compiled, releases_gil=True)
 def _run_blocks(
     tid: int,
     group: int,

@@ -32,7 +32,6 @@ _WITHOUT_S = 2.0
 # The tracer thread computes in Python for up to several seconds. The link thread must not wait
 # Python's default of 5 ms after every send or receive.
 _SWITCH_S = 1e-4
-_WORDS = 8  # of a command line, among which a script is sought
 
 
 class ProcessInjection(CompanionFault):
@@ -192,8 +191,9 @@ def _process_of(leader: int | None, executable: str | None) -> int | None:
         with contextlib.suppress(OSError):  # it has ended, or is another user's
             if os.getsid(pid) != leader:
                 continue
-            words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[:_WORDS]
-            files = [os.readlink(f"/proc/{pid}/exe"), *map(os.fsdecode, words)]
+            name, *words = map(os.fsdecode, Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"))
+            script = next((word for word in words if not word.startswith("-")), "")
+            files = [os.readlink(f"/proc/{pid}/exe"), name, script]
             if executable in [Path(file).name for file in files]:
                 return pid
     return None
