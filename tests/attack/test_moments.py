@@ -3,6 +3,8 @@
 import contextlib
 import faulthandler
 import subprocess
+import sys
+import threading
 import time
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from mavfi_cli.core.errors import TargetError, UnknownName
 from mavfi_cli.fi.tracer import record, stepper
 from mavfi_cli.fi.tracer.fault import Strategy
 from mavfi_cli.fi.tracer.image import Image
+from mavfi_cli.fi.tracer.tracee import Tracee
 
 UNIFORM = Strategy.of("instruction-uniform")
 
@@ -186,3 +189,29 @@ def test_a_program_that_is_killed_before_its_thread_has_stopped(workers, tmp_pat
     monkeypatch.setattr("mavfi_cli.fi.tracer.tracee.Tracee.interrupt", killed)
     with pytest.raises(TargetError, match="has ended"):
         strike(workers, tmp_path)
+
+
+def test_other_threads_run_while_a_thread_is_stepped():
+    everywhere = np.array([[0, 1 << 47]])
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as process:
+
+        def step():
+            tracee = Tracee.attach(process.pid)
+            trace = np.empty(200_000, np.int64)
+            executed, why, _ = stepper.record_steps(
+                tracee.tid, tracee.group, everywhere, trace, stepper.NO_END
+            )
+            ends.append((executed, why))
+            tracee.detach()
+
+        time.sleep(0.5)  # the interpreter has started and makes no system call
+        stepper.load()
+        ends, turns = [], 0
+        tracer = threading.Thread(target=step)
+        tracer.start()
+        while tracer.is_alive():
+            time.sleep(0.001)
+            turns += 1
+        process.kill()
+    assert ends == [(200_000, stepper.FULL)]
+    assert turns > 50  # one call steps for nearly the whole time
