@@ -23,6 +23,7 @@ from mavfi_cli.report.summary import summary_lines
 from mavfi_cli.report.top_view import draw_top_view
 from mavfi_cli.report.view.entries import ViewedFlight
 from mavfi_cli.spec.companion import CompanionConfig, ProgramConfig, SuccessConfig
+from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 HOP = Path(__file__).with_name("hop.py")
@@ -232,6 +233,13 @@ def test_a_command_line_may_end_in_toml_and_names_the_files_that_it_depends_on(
     assert CompanionConfig.load(f"python -c '{'x' * 400}' a.toml").files == ()
     with pytest.raises(ConfigError, match="No such file"):
         CompanionConfig.load("hopp.toml")
+
+
+def test_a_companions_flight_on_a_real_autopilot_may_have_a_fault_in_an_instruction():
+    fault = InstructionConfig(target="companion")
+    MissionConfig(companion="true {link}", autopilot="px4", instruction=fault)
+    with pytest.raises(ConfigError, match="do not repeat exactly"):
+        MissionConfig(autopilot="px4", instruction=fault)
 
 
 def test_the_golden_folder_lies_beside_the_companions_file(tmp_path):

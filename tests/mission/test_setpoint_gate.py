@@ -11,8 +11,11 @@ import time
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from live_processes import LONG_S
 
+from mavfi_cli.cli.gate import gate as gate_command
+from mavfi_cli.cli.train import train as train_command
 from mavfi_cli.core.errors import MavfiError, ModelError
 from mavfi_cli.core.types import Command, StackMark, Trajectory
 from mavfi_cli.detect.fit import fit
@@ -27,6 +30,7 @@ from mavfi_cli.mission.setpoint_gate import SetpointGate
 from mavfi_cli.mission.setpoints import SetpointView, command_of, samples_of_tlog
 from mavfi_cli.spec.companion import CompanionConfig, GateConfig
 from mavfi_cli.spec.detector import DetectorConfig
+from mavfi_cli.studies.train import _mark_of
 
 MARK = StackMark(name="companion:hop", digest="1")
 VELOCITY = 0b1101_1100_0111
@@ -341,3 +345,31 @@ def test_the_gate_passes_frames_byte_for_byte_and_fails_as_configured(model, fai
             data = passed()
         assert data == (wild if fails == "open" else heartbeat)
     assert f"has failed {fails}" in log.read_text()
+
+
+def test_a_companions_file_has_the_defaults_of_the_gate(tmp_path, monkeypatch):
+    run = []
+    monkeypatch.setattr(gate_process.GateProcess, "run", lambda gate: run.append(gate) or 0)
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        "key_file = 'key'\n[program.fly]\ncommand = 'not-here {link}'\n"
+        "[gate]\naction = 'brake'\npatience = 2\n"
+    )
+    done = CliRunner().invoke(gate_command, ["--companion", str(path), "--patience", "3"])
+    assert done.exit_code == 0, done.output
+    (gate,) = run
+    assert (gate.settings.action, gate.settings.patience) == ("brake", 3)
+    assert gate.key_file == str(tmp_path / "key")
+    assert gate.mark == CompanionConfig.load(str(path), starts=False).mark
+
+
+def test_a_model_from_logs_belongs_to_the_companion_that_is_named(tmp_path, monkeypatch):
+    log = tmp_path / "flight.tlog"
+    log.write_bytes(b"")
+    plans = []
+    monkeypatch.setattr("mavfi_cli.studies.train.train", lambda plan, *_: plans.append(plan))
+    asked = ["--from", str(log), "--companion", "not-here {link}", "--quiet"]
+    CliRunner().invoke(train_command, [*asked, "--out", str(tmp_path / "out")])
+    (plan,) = plans
+    assert plan.logs == (log,)
+    assert _mark_of(plan) == CompanionConfig.load("not-here {link}", starts=False).mark
