@@ -17,7 +17,6 @@ from pathlib import Path
 from mavfi_cli.core.config import load_toml
 from mavfi_cli.core.errors import ConfigError, LinkError, UnknownName
 from mavfi_cli.core.types import StackMark
-from mavfi_cli.link.endpoint import parse_endpoint
 
 RESTARTS = ("never", "on-failure", "always")
 ACTIONS, ON_ERROR = ("hold", "brake", "autopilot"), ("open", "closed")
@@ -270,6 +269,8 @@ class CompanionConfig:
 
     def _check_link(self) -> None:
         """Reject a link beyond this machine, and one that needs a listening program."""
+        from mavfi_cli.link.endpoint import parse_endpoint
+
         try:
             end = parse_endpoint(self.url)
         except LinkError as error:
