@@ -11,6 +11,7 @@ import pytest
 from live_processes import LONG_S
 
 from mavfi_cli import library
+from mavfi_cli.cli.fly import _TOO_SHORT
 from mavfi_cli.core.errors import FaultSpecError, MavfiError, UnknownName
 from mavfi_cli.fi.injector import Moment
 from mavfi_cli.link.codec import Codec, Signing, dialect, frame_of, key_from_passphrase
@@ -113,6 +114,14 @@ def test_a_swapped_message_follows_the_next_of_its_own_side():
     assert passed(link, ours) == []
     assert passed(link, theirs, Side.AUTOPILOT) == theirs
     assert len(passed(link, ours)) == 2
+
+
+def test_the_hint_knows_the_reason_of_a_random_time_after_the_flight(tmp_path):
+    fault = CompanionInjection(FaultConfig(target="process.hop"))
+    fault.aim_at(1.0)
+    fault.begin(tmp_path / "fault.json")
+    fault.tick(at(0.0))
+    assert fault.injector.missed.startswith(_TOO_SHORT)
 
 
 def test_a_program_that_does_not_run_is_not_struck(tmp_path):
