@@ -82,7 +82,7 @@ _detector, _output = section("Detector"), section("Output")
 @_mission("--companion", metavar="FILE|CMD",
           help="Fly with your own companion in place of mavfi's: a TOML file or a command line, in "
                "which {link}, {goal} and others are filled in.")  # fmt: skip
-@_mission("--speed", type=types.SPEED, default=1.0,
+@_mission("--speed", default=1.0,
           help="Pace of the vehicle with --companion, in times real time.")  # fmt: skip
 @_mission("--golden", "golden", type=types.MISSIONS, metavar="N",
           help="Fly the mission N times without fault and detector, and report how far the flights "

@@ -36,7 +36,7 @@ _LOG = click.Path(path_type=Path, exists=True, dir_okay=False)
 @option("--companion", metavar="FILE|CMD",
         help="Fly your own companion, and fit models for its gate. With --from, name the "
              "companion that flew.")  # fmt: skip
-@option("--speed", type=types.SPEED, default=1.0,
+@option("--speed", default=1.0,
         help="Pace of the vehicle with --companion, in times real time.")  # fmt: skip
 @option("--from", "log", type=_LOG,
         help="Do not fly; fit to this .tlog of a fault-free flight of your own companion and to "

@@ -26,7 +26,6 @@ MISSIONS = click.IntRange(1, 1_000_000)  # flights or runs; also the limit of a 
 SEED = click.IntRange(0, 2**31 - 1)
 FIRST_SEED = click.IntRange(0, 2**31 - 1_000_001)  # each further mission adds 1
 BITS, BIT = click.IntRange(1, 64), click.IntRange(0, 63)  # of a state
-SPEED = Number(min=0.01, max=100.0)
 ABOVE_ZERO = Number(min=1.0e-6, max=1.0e6)
 CONFIDENCE = Number(0.0, 1.0, min_open=True, max_open=True)
 SHARE, SCALE = Number(0.0, 1.0), Number(0.0, 1000.0, min_open=True)

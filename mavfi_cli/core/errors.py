@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Self, TypeVar
@@ -136,6 +136,18 @@ class ConfigError(MavfiError):
         """Create the error for a key that does not exist. It suggests the nearest known key."""
         problem = f"unknown key; {_suggestion(key.rpartition('.')[2], known)}"
         return cls(problem, path=path, line=line, key=key)
+
+    @classmethod
+    def check_limits(cls, config: object, limits: Mapping[str, tuple[float, float]]) -> None:
+        """Raise the error for the first number of `config` outside its limits, which are allowed.
+
+        A setting that `config` does not have, or that is None, is not checked.
+        """
+        for key, (low, high) in limits.items():
+            value = getattr(config, key, None)
+            if value is not None and not low <= value <= high:
+                problem = f"must be between {low:.10g} and {high:.10g}, got {value:.10g}"
+                raise cls(problem, key=key)
 
 
 class WorldError(MavfiError):

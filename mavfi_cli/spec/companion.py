@@ -43,13 +43,6 @@ LIMITS = {  # minimum and maximum of each number
 }
 
 
-def _require_limits(config: object) -> None:
-    for name, (low, high) in LIMITS.items():
-        value = getattr(config, name, None)
-        if value is not None and not low <= value <= high:
-            raise ConfigError(f"must be between {low:g} and {high:g}", key=name)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProgramConfig:
     """One program of a user's companion: how mavfi starts, awaits and restarts it.
@@ -93,7 +86,7 @@ class ProgramConfig:
                 )
         if self.restart not in RESTARTS:
             raise UnknownName("restart rule", self.restart, RESTARTS)
-        _require_limits(self)
+        ConfigError.check_limits(self, LIMITS)
         try:
             re.compile((self.ready_line or "").encode())
         except (re.error, UnicodeError) as error:
@@ -152,7 +145,7 @@ class SuccessConfig:
     golden: str | None = None
 
     def __post_init__(self) -> None:
-        _require_limits(self)
+        ConfigError.check_limits(self, LIMITS)
         if (self.corridor_m is None) != (self.golden is None):
             raise ConfigError(
                 "must be given together with golden, the run folder of the flight to stay close to",
@@ -191,7 +184,7 @@ class GateConfig:
             raise UnknownName("action", self.action, ACTIONS)
         if self.on_error not in ON_ERROR:
             raise UnknownName("on_error", self.on_error, ON_ERROR)
-        _require_limits(self)
+        ConfigError.check_limits(self, LIMITS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -245,7 +238,7 @@ class CompanionConfig:
                 raise ConfigError(
                     f"the name must be 1 to 40 letters, digits, - or _, got {name!r}", key=name
                 )
-        _require_limits(self)
+        ConfigError.check_limits(self, LIMITS)
         if (self.flight_s or 0.0) > (self.time_limit_s or math.inf):
             raise ConfigError("must be at most time_limit_s", key="flight_s")
         if self.success.exit is not None and self.success.exit not in self.program:

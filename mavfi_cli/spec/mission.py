@@ -152,11 +152,7 @@ class MissionConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "planner", canonical_planner(self.planner))
-        for name, (low, high) in LIMITS.items():
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                limits = f"between {low:.10g} and {high:.10g}"
-                raise ConfigError(f"must be {limits}, got {value:.10g}", key=name)
+        ConfigError.check_limits(self, LIMITS)
         for name in ("start", "goal", "origin"):
             place = getattr(self, name) or ()
             if not all(map(math.isfinite, place)):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import re
 import tomllib
 from dataclasses import MISSING, dataclass, field, fields
@@ -126,10 +125,7 @@ class Stack:
     sources: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for key, (low, high) in _LIMITS.items():
-            value = getattr(self, key)
-            if not (math.isfinite(value) and low <= value <= high):
-                raise ValueError(f"{key}: must be between {low:g} and {high:g}, got {value:g}")
+        ConfigError.check_limits(self, _LIMITS)
         self._check_processes()
         for node in self.standby:
             _require_node("standby", node)
