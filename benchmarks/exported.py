@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from mavfi_cli.stats.paired import McNemar
-from mavfi_cli.stats.shares import wilson
+from mavfi_cli.stats.shares import Share, clustered_share, wilson
 
 Row = Mapping[str, Any]
 Key = tuple[Any, ...]
@@ -46,10 +46,23 @@ def golden_lost(rows: list[Row]) -> dict[Key, bool]:
 
 def share(count: int, total: int) -> str:
     """Return count, total and percentage as text, with the percentage's 95 % Wilson interval."""
-    if total == 0:
+    return _text(wilson(count, total))
+
+
+def share_lost(rows: list[Row]) -> str:
+    """Return the share of lost missions as text, with a 95 % interval over their seeds.
+
+    Faults of one seed are alike in all worlds and on all stacks, so each seed is a cluster.
+    """
+    seeds = [("seeds", row["seed"]) for row in rows]
+    return _text(clustered_share([*map(lost, rows)], seeds, {}))
+
+
+def _text(whole: Share) -> str:
+    if whole.total == 0:
         return "0 of 0"
-    whole = wilson(count, total)
-    return f"{count} of {total}, {whole.share:.0%} ({whole.low:.0%} to {whole.high:.0%})"
+    ends = f"{whole.low:.0%} to {whole.high:.0%}"
+    return f"{whole.count} of {whole.total}, {whole.share:.0%} ({ends})"
 
 
 def against(one: Mapping[Key, bool], other: Mapping[Key, bool]) -> McNemar:

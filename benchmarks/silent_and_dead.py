@@ -7,14 +7,14 @@ Reads exports of campaigns (`mavfi campaign export`). A mission counts if its go
 same world, world seed, seed, stack and platform) succeeded. The first column of counts has all
 faults, as the paper counts, and the others those that were read or ended their node. A fault is
 dead if its node ended, and silent otherwise. A mission is lost if it does not end in success.
-Intervals are Wilson's, 95 %.
+Intervals are Wilson's, 95 %, and take the missions of each seed as a cluster.
 """
 
 from __future__ import annotations
 
 import collections
 
-from exported import PAIRED, Row, arguments, flown, golden_lost, key, lost, share
+from exported import PAIRED, Row, arguments, flown, golden_lost, key, share_lost
 
 
 def main() -> None:
@@ -34,8 +34,7 @@ def main() -> None:
         dead = [row for row in cell if row["node_ended"]]
         silent = [row for row in cell if row["activation"] == "read" and not row["node_ended"]]
         parts = (cell, dead + silent, dead, silent)
-        counts = (share(sum(map(lost, part)), len(part)) for part in parts)
-        print(f"| {' | '.join(name)} | {' | '.join(counts)} |")
+        print(f"| {' | '.join(name)} | {' | '.join(map(share_lost, parts))} |")
 
 
 if __name__ == "__main__":
