@@ -26,13 +26,12 @@ from numpy.typing import NDArray
 from mavfi_cli.core.errors import ModelError, UnknownName
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import DType, FloatArray, Stage
-from mavfi_cli.detect import gaussian, span
+from mavfi_cli.detect import baselines, gaussian
 from mavfi_cli.detect.autoencoder import CODED, HIDDEN, AutoencoderDetector
 from mavfi_cli.detect.base import Detector, Model, checked_threshold
-from mavfi_cli.detect.norm import NormDetector
+from mavfi_cli.detect.baselines import NormDetector, RangeDetector
 from mavfi_cli.detect.offline import Dataset, FlightSamples
 from mavfi_cli.detect.preprocess import COUNT, DETECTED, EXTENDED, NAMES, Ranges
-from mavfi_cli.detect.span import RangeDetector
 
 FLIGHTS_MIN = 10
 KINDS = ("gad", "aad", "range", "l2")
@@ -90,7 +89,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
     elif kind == "range":
         rows = _mirrored(flights)
         lowest, highest = np.minimum(rows.min(axis=0), 0), np.maximum(rows.max(axis=0), 0)
-        margin = np.array([span.MARGIN])
+        margin = np.array([baselines.MARGIN])
         detector = RangeDetector({"margin": margin, "lowest": lowest, "highest": highest})
     else:
         scale = _scale_of(train)

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from mavfi_cli.core.types import CollisionReport, Command, FloatArray, Message, Stage, Trajectory
 from mavfi_cli.detect import preprocess
 from mavfi_cli.detect.base import OF_CONTROL, OF_PLANNING, PASSED, Detector, FittedDetector
+from mavfi_cli.detect.baselines import MARGIN
 from mavfi_cli.detect.preprocess import COUNT, EXTENDED, NAMES, SPANS, Codes, PreprocessParams
-from mavfi_cli.detect.span import MARGIN
 
 _NO_WAYPOINTS = np.zeros((0, 10))
 _TICK, _TICK_AND_WAYPOINT = (Stage.CONTROL,), (Stage.PLANNING, Stage.CONTROL)

@@ -20,10 +20,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mavfi_cli.core.errors import ConfigError, LinkLost
-from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.flight_record import ProgramEnds
 from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import Briefing, Command, FloatArray, Outcome, VehicleState
@@ -43,7 +40,8 @@ from mavfi_cli.mission.progress import FlightLogger, FlightProgress, Watcher
 from mavfi_cli.mission.run_folder import RunFolder, Trace, load_run
 from mavfi_cli.mission.setpoint_gate import SetpointGate
 from mavfi_cli.mission.setpoints import command_of
-from mavfi_cli.spec.companion import CompanionConfig, SuccessConfig
+from mavfi_cli.mission.success import SuccessVerdict
+from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
 
 _TURN_S = 0.02
@@ -51,7 +49,6 @@ _SERVE_S = 0.02  # longest time to serve the links in a turn
 _HEARTBEATS_S = 2.0  # time in which a heartbeat reports that the vehicle is armed
 _BOOT_S = 60.0  # simulated time after which programs start even if the vehicle cannot arm yet
 _SILENCE_S = 60.0  # wall-clock time without a message after which the vehicle counts as lost
-_REST_MPS, _REST_S = 0.5, 1.0  # largest speed at rest, and how long it must last
 _MOST_EVENTS = 1000
 _NO_SYSTEM = 255  # target of a setpoint that ends a tick and commands nothing
 _NO_TARGET = (0x0FFF, *[0.0] * 11)  # type mask that ignores all fields, and the fields
@@ -103,7 +100,7 @@ class CompanionFlight:
         self._over_s = math.inf  # stamp at which every program had ended
         self._next_progress_s = 0.0
         self._crew = Crew(companion, self.logger.note)
-        self._verdict = _Verdict(companion.success, self._crew)
+        self._verdict = SuccessVerdict(companion.success, self._crew)
         self._golden_s = _flight_s_of(companion.success.golden)
         self._time_limit_s = min(config.time_limit_s, companion.time_limit_s or math.inf)
         self._goal_enu_m: FloatArray | None = None
@@ -523,105 +520,3 @@ class LockstepFlight(CompanionFlight):
         if side is Side.AUTOPILOT and self._is_tick(message):
             self._awaited_ms = message.time_boot_ms
         return super()._deliver(message, side)
-
-
-class _Verdict:
-    """Decides whether a flight has succeeded.
-
-    Attributes:
-        goal_enu_m: Goal, of shape (3,), in metres.
-        landed: True if the vehicle has flown and stands disarmed on the ground.
-        flew: True once the vehicle has been in the air.
-
-    Raises:
-        RecordError: The golden flight that defines the corridor cannot be read.
-        ConfigError: The trace of the golden flight has fewer than two positions, or one that is not
-            finite.
-    """
-
-    def __init__(self, success: SuccessConfig, crew: Crew) -> None:
-        self._success, self._crew = success, crew
-        self.goal_enu_m: FloatArray | None = None
-        self.landed = self.flew = False
-        self._rest_since_s = math.inf
-        self._rests = False
-        self.deviation_m = 0.0  # largest distance from the golden path
-        self._path = None if success.golden is None else path_of(Path(success.golden))
-
-    def see(self, state: VehicleState) -> None:
-        """Update the verdict with a new state of the vehicle."""
-        if self._path is not None:
-            self.deviation_m = max(
-                self.deviation_m, distance_from(state.position_enu_m, self._path)
-            )
-        near_m = self._success.goal_m
-        assert self.goal_enu_m is not None
-        if (
-            near_m is None
-            or not self.flew
-            or norm(state.position_enu_m - self.goal_enu_m) > near_m
-            or norm(state.velocity_enu_mps) > _REST_MPS
-        ):
-            self._rest_since_s, self._rests = math.inf, False
-        else:
-            self._rest_since_s = min(self._rest_since_s, state.stamp_s)
-            self._rests = state.stamp_s - self._rest_since_s >= _REST_S
-
-    def describe(self) -> str:
-        """Describe the conditions of success that are configured."""
-        success = self._success
-        parts = (
-            "" if success.goal_m is None else f"at rest within {success.goal_m:g} m of the goal",
-            "landed" if success.landed else "",
-            "" if success.exit is None else f"{success.exit} ended with code 0",
-            "" if success.corridor_m is None else f"within {success.corridor_m:g} m of the path",
-        )
-        return ", ".join(filter(None, parts))
-
-    @property
-    def strayed(self) -> bool:
-        """True if the vehicle has left the corridor."""
-        corridor_m = self._success.corridor_m
-        return corridor_m is not None and self.deviation_m > corridor_m
-
-    def is_over(self) -> bool:
-        """Return True if all configured conditions of success hold, apart from the corridor.
-
-        If no such condition is configured, return True once every program has ended.
-        """
-        success = self._success
-        ends = (
-            *([self._rests] if success.goal_m is not None else ()),
-            *([self.landed] if success.landed else ()),
-            *([self._crew.succeeded(success.exit)] if success.exit is not None else ()),
-        )
-        return all(ends or (self._crew.over,))
-
-
-def path_of(folder: Path) -> FloatArray:
-    """Read the path of a flight from its run folder: positions (n, 3) in ENU, in metres.
-
-    Raises:
-        RecordError: The trace cannot be read.
-        ConfigError: The trace has fewer than two positions, or one that is not finite.
-    """
-    trace = read_parquet(RunFolder(folder).trace, "golden trace")
-    try:
-        path = np.column_stack([trace[name].to_numpy() for name in ("x_m", "y_m", "z_m")])
-    except KeyError:
-        path = np.zeros((0, 3))
-    if len(path) < 2:
-        raise ConfigError("the golden trace has fewer than two positions", key="success.golden")
-    if not np.isfinite(path).all():
-        raise ConfigError(
-            "the golden trace has a position that is not finite", key="success.golden"
-        )
-    return path
-
-
-def distance_from(place: FloatArray, path: FloatArray) -> float:
-    """Return the distance, in metres, from a point of shape (3,) to a polyline of shape (n, 3)."""
-    begin, along = path[:-1], np.diff(path, axis=0)
-    lengths = np.maximum((along**2).sum(axis=1), 1e-12)
-    shares = np.clip(((place - begin) * along).sum(axis=1) / lengths, 0.0, 1.0)
-    return float(np.sqrt(((begin + shares[:, None] * along - place) ** 2).sum(axis=1)).min())

@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.mission.companion_flight import distance_from, path_of
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_to_end
 from mavfi_cli.mission.run_folder import Run
+from mavfi_cli.mission.success import FlownPath
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.shares import wilson
 
@@ -46,8 +46,9 @@ class Spread:
         times = sorted(own.flight_time_s for own in qualities if own.flight_time_s is not None)
         apart = []
         for run in good[1:]:
-            first = path_of(good[0].folder.path)
-            apart.append(max(distance_from(p, first) for p in path_of(run.folder.path)))
+            first = FlownPath.of(good[0].folder.path)
+            places = FlownPath.of(run.folder.path).places
+            apart.append(max(map(first.distance_m, places)))
         return cls(
             outcomes=dict(Counter(run.record.outcome for run in runs)),
             succeeded=(share.share, share.low, share.high),

@@ -16,21 +16,25 @@ from mavfi_cli.fi.tracer.spawn import Program
 
 HOLDER = """
 import os, sys
-from mavfi_cli.attack.campaign import one_processor
+from mavfi_cli.attack.campaign import _claims, one_processor
 with one_processor():
-    print(*os.sched_getaffinity(0), flush=True)
+    print(*os.sched_getaffinity(0), int(bool(_claims[-1].getsockname())), flush=True)
     sys.stdin.read()
 """
 
 
 @contextlib.contextmanager
 def another_campaign():
-    """The processors of another process, while that is attacking."""
+    """The processors of another process while that is attacking, and whether it has claimed one.
+
+    It has none of its own if the campaigns of other tests have claimed all of them.
+    """
     process = subprocess.Popen(
         [sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     try:
-        yield set(map(int, process.stdout.readline().split()))
+        *processors, claimed = map(int, process.stdout.readline().split())
+        yield set(processors), bool(claimed)
     finally:
         process.communicate("")
 
@@ -39,10 +43,10 @@ def test_two_campaigns_stay_on_different_processors():
     before = os.sched_getaffinity(0)
     if len(before) < 2:
         pytest.skip("one processor")
-    with another_campaign() as theirs, one_processor():
+    with another_campaign() as (theirs, they_claimed), one_processor():
         ours = os.sched_getaffinity(0)
         assert len(ours) == len(theirs) == 1
-        if any(map(is_free, before)):  # else other campaigns use all that are left
+        if they_claimed and campaign._claims[-1].getsockname():
             assert ours != theirs
     assert os.sched_getaffinity(0) == before
 
@@ -64,10 +68,10 @@ def test_a_campaign_stays_where_it_began_until_it_is_over(native_program):
         ours = os.sched_getaffinity(0)
     with one_processor():
         assert os.sched_getaffinity(0) == ours
-    with another_campaign() as theirs:
-        assert theirs != ours or not any(map(is_free, os.sched_getaffinity(0)))
     (claim,) = campaign._claims
-    if claim.getsockname():  # else other campaigns had claimed all, and this one shares
-        assert not any(is_free(processor) for processor in ours)
+    if claim.getsockname():  # else the campaigns of other tests have claimed all
+        with another_campaign() as (theirs, they_claimed):
+            assert not they_claimed or theirs != ours
+        assert not any(map(is_free, ours))
     run_campaign(Plan(runs=1, seed=1), [program])
     assert not campaign._claims

@@ -3,9 +3,8 @@ import numpy as np
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect import base
 from mavfi_cli.detect.autoencoder import AutoencoderDetector
-from mavfi_cli.detect.norm import NormDetector
+from mavfi_cli.detect.baselines import NormDetector, RangeDetector
 from mavfi_cli.detect.preprocess import COUNT
-from mavfi_cli.detect.span import RangeDetector
 
 
 def test_inference_is_that_of_the_net_written_in_numpy():

@@ -1,4 +1,8 @@
-"""Baseline detector `range`: each delta must lie within its range in error-free flights."""
+"""Baseline detectors: `range` and `l2`.
+
+`range` asks whether each delta lies within its range in error-free flights, `l2` for the norm of
+all deltas, each in units of its scale.
+"""
 
 from __future__ import annotations
 
@@ -40,3 +44,25 @@ def _outside(memory: FloatArray, deltas: Codes, first: int, end: int) -> float:
             return math.nan
         worst = max(worst, below, above)
     return worst
+
+
+class NormDetector(FittedDetector):
+    """Detector whose score is the Euclidean norm of the scaled deltas."""
+
+    name: ClassVar[str] = "l2"
+    per_stage = False
+    shapes: ClassVar[Shapes] = {"threshold": (1,), "scale": (COUNT,)}
+    divisors: ClassVar[tuple[str, ...]] = ("scale",)
+
+    def score(self, deltas: Codes, stage: Stage) -> float:
+        """Return the Euclidean norm of all deltas, each divided by its scale."""
+        return _norm(self.flat, deltas)
+
+
+@compiled
+def _norm(memory: FloatArray, deltas: Codes) -> float:
+    total = 0.0
+    for place in range(COUNT):
+        scaled = deltas[place] / memory[1 + place]
+        total += scaled * scaled
+    return math.sqrt(total)
