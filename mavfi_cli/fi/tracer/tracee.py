@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import fcntl
 import os
 import select
 import signal
@@ -51,6 +52,10 @@ _SYSTEM_CALL = b"\x0f\x05"  # the instruction
 _NO_CALL = (1 << 64) - 1  # replaces the number of a system call that has begun, to skip it
 _FREE = 512  # bytes below the stack pointer that no function uses, with room for a socket address
 _ALL_ACCESS, _PRIVATE_FIXED, _NO_FILE = 7, 0x10_0022, (1 << 64) - 1  # mmap, MAP_FIXED_NOREPLACE
+
+# PIDFD_GET_INFO of linux/pidfd.h: the number, the mask and the last field of `struct pidfd_info`,
+# and the bit of the mask for the status.
+_GET_INFO, _PIDFD_INFO, _INFO_EXIT = 0xC040_FF0B, struct.Struct("<Q52xi"), 1 << 3
 
 _TYPE_BREAKPOINT, _EXECUTE, _LENGTH, _CLOSE_ON_EXEC = 5, 4, 8, 8
 _DISABLED_AT_EXEC_END = 1 << 36 | 1 << 37  # remove_on_exec, sigtrap
@@ -219,18 +224,26 @@ class EndWatch:
     def look(self) -> Ended | None:
         """Return how the process ended, or None if it still runs.
 
-        The exit status is unknown if the process has already been reaped.
+        Before Linux 6.15, the exit status is unknown if the process has already been reaped.
         """
         if not self._poller.poll(0):
             return None
-        try:
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
             stat = Path(f"/proc/{self._pid}/stat").read_text()
-        except (FileNotFoundError, ProcessLookupError):
-            return Ended(exit_code=None, signal=None)
-        state, *_, status = stat.rpartition(")")[2].split()  # field 52, proc_pid_stat(5)
-        if state != "Z":  # another process has reused its id
-            return Ended(exit_code=None, signal=None)
-        return Ended.of(os.waitstatus_to_exitcode(int(status)))
+            state, *_, status = stat.rpartition(")")[2].split()  # field 52, proc_pid_stat(5)
+            if state == "Z":  # else another process has reused its id
+                return Ended.of(os.waitstatus_to_exitcode(int(status)))
+        return self._reaped()
+
+    def _reaped(self) -> Ended:
+        """Return how the process ended that has been reaped, if the kernel still knows it."""
+        info = bytearray(_PIDFD_INFO.pack(_INFO_EXIT, 0))
+        with contextlib.suppress(OSError):
+            fcntl.ioctl(self._descriptor, _GET_INFO, info)
+            known, status = _PIDFD_INFO.unpack(info)
+            if known & _INFO_EXIT:
+                return Ended.of(os.waitstatus_to_exitcode(status))
+        return Ended(exit_code=None, signal=None)
 
     def close(self) -> None:
         """Stop watching the process."""
