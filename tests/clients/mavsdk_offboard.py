@@ -17,6 +17,10 @@ async def until(stream, accepted):
             return
 
 
+def beyond(north_m):
+    return lambda state: state.position.north_m > north_m
+
+
 async def main(address, port):
     drone = System(port=port)
     await drone.connect(system_address=address)
@@ -28,15 +32,15 @@ async def main(address, port):
     await drone.offboard.set_velocity_ned(VelocityNedYaw(0.0, 0.0, 0.0, 0.0))
     await drone.offboard.start()
     await drone.offboard.set_velocity_ned(VelocityNedYaw(2.0, 0.0, 0.0, 0.0))
-    north = drone.telemetry.position_velocity_ned
-    await until(north(), lambda p: p.position.north_m > 5.0)
+    begun_m = (await anext(drone.telemetry.position_velocity_ned())).position.north_m
+    await until(drone.telemetry.position_velocity_ned(), beyond(begun_m + 5.0))
     if FAULT == "dies":
         os.kill(os.getpid(), signal.SIGKILL)
     if FAULT == "wild":  # once; mavsdk_server repeats it until the next one
         await drone.offboard.set_velocity_ned(VelocityNedYaw(-1000.0, 0.0, 0.0, 0.0))
         await asyncio.sleep(float(os.environ["WILD_S"]))
         await drone.offboard.set_velocity_ned(VelocityNedYaw(2.0, 0.0, 0.0, 0.0))
-    await until(north(), lambda p: p.position.north_m > 20.0)
+    await until(drone.telemetry.position_velocity_ned(), beyond(begun_m + 20.0))
     await drone.offboard.set_velocity_ned(VelocityNedYaw(0.0, 0.0, 0.0, 0.0))
     await asyncio.sleep(2.0)
     await drone.offboard.stop()

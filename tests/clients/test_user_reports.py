@@ -1,0 +1,91 @@
+"""Two reports of users: a dead script with a living server, and a single wild setpoint.
+
+A script on MAVSDK dies, and its `mavsdk_server` goes on sending the last setpoint
+(mavlink/MAVSDK-Python 374 and 741). One velocity of -1000 m/s is flown (PX4/PX4-Autopilot 27611).
+"""
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mavfi_cli import library
+from mavfi_cli.core.types import Command
+from mavfi_cli.detect.fit import fit
+from mavfi_cli.detect.offline import Dataset, FlightSamples
+from mavfi_cli.detect.preprocess import PreprocessParams
+from mavfi_cli.spec.companion import CompanionConfig
+from mavfi_cli.spec.detector import DetectorConfig
+
+SCRIPT = Path(__file__).with_name("mavsdk_offboard.py")
+
+
+@pytest.fixture(params=["ours", "px4"])
+def fly(request, tmp_path):
+    """Flies the script with a fault, and with or without a gate that knows speeds up to 3 m/s."""
+    if request.param == "px4" and not os.environ.get("PX4_SITL"):
+        pytest.skip("PX4_SITL names no PX4")
+    path = tmp_path / "script.toml"
+
+    def flown(fault, *, threshold=None):
+        path.write_text(
+            f"[program.script]\ncommand = '{sys.executable} {SCRIPT} {{mavsdk}} {{free}}'\n"
+            f"environment = {{ FAULT = '{fault}', WILD_S = '3' }}\n[success]\nlanded = true\n"
+        )
+        detector = None
+        if threshold is not None:
+            model = fit("range", flights_of(CompanionConfig.load(str(path)).mark))
+            model.save(tmp_path / "range.json")
+            detector = DetectorConfig(
+                name="range", model=str(tmp_path / "range.json"), threshold=threshold
+            )
+        return library.fly(
+            companion=str(path), world="farm", seed=1, time_limit_s=25.0, out=tmp_path,
+            autopilot=request.param, detector=detector,
+        )  # fmt: skip
+
+    return flown
+
+
+def flights_of(mark):
+    """Ten flights of a companion in which every second setpoint is zero."""
+
+    def flight(seed):
+        rng = np.random.default_rng(seed)
+
+        def command(number):
+            velocity = rng.uniform(-3.0, 3.0, 3) * (number % 2)
+            return Command(stamp_s=0.0, velocity_enu_mps=velocity, yaw_rad=0.0)
+
+        ticks = ((0.1 * number, None, command(number)) for number in range(60))
+        return FlightSamples.of_ticks(ticks, "farm", seed)
+
+    return Dataset(flights=tuple(map(flight, range(10))), preprocess=PreprocessParams(), stack=mark)
+
+
+@pytest.mark.slow
+def test_the_server_of_a_dead_script_flies_on_until_the_gate_withholds_what_no_longer_changes(fly):
+    unguarded = fly("dies")
+    assert unguarded.record.outcome == "timeout"  # nobody has noticed
+    assert not any("ailsafe" in event.text for event in unguarded.record.events)
+    guarded = fly("dies", threshold=1e6)  # only silence counts here
+    assert guarded.record.outcome == "crash"
+    texts = [event.text for event in guarded.record.events]
+    assert any("program script is gone" in text for text in texts)
+    assert any("failsafe" in text for text in texts)
+    assert guarded.record.detection.responses["stale"] >= 1
+
+
+@pytest.mark.slow
+def test_the_gate_withholds_a_wild_setpoint(fly):
+    assert fastest_mps(fly("wild")) > 6.0
+    guarded = fly("wild", threshold=0.5)
+    assert guarded.record.outcome == "success"
+    assert fastest_mps(guarded) < 3.0
+    assert guarded.record.detection.alarm_count >= 1
+
+
+def fastest_mps(run):
+    return run.record.quality_of_flight.max_speed_mps
