@@ -7,7 +7,7 @@ stop the simulation.
 
 from __future__ import annotations
 
-import contextlib
+import fcntl
 import math
 import os
 import socket
@@ -46,6 +46,7 @@ _GONE = "PX4 closed the simulator link"
 
 _INSTANCES = 100  # maximum number of PX4 instances on a machine
 _SOCKET = "/tmp/px4-sock-{}"  # where a running instance accepts commands
+_CLAIM = "/tmp/mavfi-px4-{}"  # locked by the flight whose PX4 has this instance
 _LOCAL_PORT = 14_580  # MAVLink port of the first instance
 _TILT_SHARE = math.sqrt(0.5)  # share of each rotor's thrust at full roll or pitch
 _ROTORS = ((1, 1, 1), (-1, -1, 1), (1, -1, -1), (-1, 1, -1))  # forward, right, sense
@@ -68,8 +69,10 @@ class Px4Link:
     settle_s = 12.0  # its boot time varies between flights; its estimator has settled by then
     echoes = True
 
-    def __init__(self, transport: Transport, sensors: Sensors, port: int = PORT) -> None:
-        self._transport = transport
+    def __init__(
+        self, transport: Transport, sensors: Sensors, port: int = PORT, claim: int | None = None
+    ) -> None:
+        self._transport, self._claim = transport, claim
         self.port = port
         self._sensors = sensors
         self._codec = Codec(1, dialect.MAV_COMP_ID_AUTOPILOT1)
@@ -86,10 +89,12 @@ class Px4Link:
         """
         *others, last = range(PORT, PORT + (_INSTANCES if ours else 1))
         for port in others:
-            if _is_running(port - PORT):
+            if (claim := _claimed(port - PORT)) is None:
                 continue
-            with contextlib.suppress(LinkError):
-                return cls(open_transport(f"tcpin:127.0.0.1:{port}"), sensors, port)
+            try:
+                return cls(open_transport(f"tcpin:127.0.0.1:{port}"), sensors, port, claim)
+            except LinkError:
+                os.close(claim)
         return cls(open_transport(f"tcpin:127.0.0.1:{last}"), sensors, last)
 
     @staticmethod
@@ -166,8 +171,11 @@ class Px4Link:
         return self._throttles
 
     def close(self) -> None:
-        """Close the link."""
+        """Close the link, and let other flights have the instance of PX4."""
         self._transport.close()
+        if self._claim is not None:
+            os.close(self._claim)
+            self._claim = None
 
     def _await_answer(self, stamp_us: int) -> None:
         limit_s = ANSWER_LIMIT_S if self._answers else SILENT_WAIT_S
@@ -228,6 +236,27 @@ def _throttles(message: Message) -> Vector:
     if not message.mode & _ARMED:
         return np.zeros(4)
     return np.clip(np.nan_to_num(np.array(message.controls[:4], dtype=np.float64)), 0.0, 1.0)
+
+
+def _claimed(instance: int) -> int | None:
+    """Claim a PX4 instance for this flight. Return a descriptor, or None if the instance is taken.
+
+    Ports do not suffice: flights in networks of their own have the same ports, but PX4 locks its
+    instance in /tmp. The claim ends when the descriptor is closed.
+    """
+    if _is_running(instance):
+        return None
+    try:
+        flags = os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        claim = os.open(_CLAIM.format(instance), flags, 0o600)
+    except OSError:  # another user's, or no file
+        return None
+    try:
+        fcntl.flock(claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(claim)
+        return None
+    return claim
 
 
 def _is_running(instance: int) -> bool:

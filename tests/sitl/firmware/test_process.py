@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 import stat
 import sys
@@ -153,6 +154,7 @@ def test_a_number_that_another_px4_has_is_left_to_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(px4, "_SOCKET", str(tmp_path / "px4-{}"))
+    monkeypatch.setattr(px4, "_CLAIM", str(tmp_path / "claim-{}"))
     monkeypatch.setattr(px4, "PORT", 45_600)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
         other.bind(str(tmp_path / "px4-0"))
@@ -163,3 +165,23 @@ def test_a_number_that_another_px4_has_is_left_to_it(
     link = Px4Link.open(Sensors(1), ours=True)
     link.close()
     assert link.port == 45_600
+
+
+def test_flights_in_networks_of_their_own_have_different_instances(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(px4, "_SOCKET", str(tmp_path / "px4-{}"))
+    monkeypatch.setattr(px4, "_CLAIM", str(tmp_path / "claim-{}"))
+    monkeypatch.setattr(px4, "PORT", 45_700)
+    os.mkfifo(tmp_path / "claim-0")
+    (tmp_path / "claim-1").symlink_to(tmp_path / "elsewhere")
+    first = Px4Link.open(Sensors(1), ours=True)
+    first._transport.close()  # the port is free in another network
+    second = Px4Link.open(Sensors(1), ours=True)
+    first.close()
+    third = Px4Link.open(Sensors(1), ours=True)
+    assert not (tmp_path / "elsewhere").exists()
+    assert second.port > first.port
+    assert third.port == first.port
+    second.close()
+    third.close()
