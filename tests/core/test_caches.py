@@ -85,8 +85,8 @@ def test_functions_compile_where_nothing_beside_the_sources_can_be_written(tmp_p
         "access = os.access\n"
         "os.access = lambda path, mode: PACKAGE not in [path, *pathlib.Path(path).parents] "
         "and access(path, mode)\n"
-        "from mavfi_cli.detect import norm\n"
-        "print(norm._norm._cache.cache_path)\n"
+        "from mavfi_cli.detect import baselines\n"
+        "print(baselines._norm._cache.cache_path)\n"
     )
     environment = {name: value for name, value in os.environ.items() if name not in VARIABLES}
     environment |= {"XDG_CACHE_HOME": str(tmp_path), "NUMBA_DISABLE_JIT": "0"}
