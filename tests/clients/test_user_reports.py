@@ -29,7 +29,7 @@ def fly(request, tmp_path):
         pytest.skip("PX4_SITL names no PX4")
     path = tmp_path / "script.toml"
 
-    def flown(fault, *, threshold=None):
+    def flown(fault, *, threshold=None, time_limit_s=25.0):
         path.write_text(
             f"[program.script]\ncommand = '{sys.executable} {SCRIPT} {{mavsdk}} {{free}}'\n"
             f"environment = {{ FAULT = '{fault}', WILD_S = '3' }}\n[success]\nlanded = true\n"
@@ -42,7 +42,7 @@ def fly(request, tmp_path):
                 name="range", model=str(tmp_path / "range.json"), threshold=threshold
             )
         return library.fly(
-            companion=str(path), world="farm", seed=1, time_limit_s=25.0, out=tmp_path,
+            companion=str(path), world="farm", seed=1, time_limit_s=time_limit_s, out=tmp_path,
             autopilot=request.param, detector=detector,
         )  # fmt: skip
 
@@ -81,7 +81,7 @@ def test_the_server_of_a_dead_script_flies_on_until_the_gate_withholds_what_no_l
 @pytest.mark.slow
 def test_the_gate_withholds_a_wild_setpoint(fly):
     assert fastest_mps(fly("wild")) > 6.0
-    guarded = fly("wild", threshold=0.5)
+    guarded = fly("wild", threshold=0.5, time_limit_s=60.0)
     assert guarded.record.outcome == "success"
     assert fastest_mps(guarded) < 3.0
     assert guarded.record.detection.alarm_count >= 1
