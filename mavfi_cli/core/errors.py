@@ -139,7 +139,7 @@ class ConfigError(MavfiError):
 
     @classmethod
     def check_limits(cls, config: object, limits: Mapping[str, tuple[float, float]]) -> None:
-        """Raise the error for the first number of `config` outside its limits, which are allowed.
+        """Raise the error for the first number of `config` that is below or above its limits.
 
         A setting that `config` does not have, or that is None, is not checked.
         """

@@ -150,12 +150,15 @@ def test_a_port_in_use_is_told(kind: str, family: int, port: int) -> None:
             _open(kind, None)
 
 
-def test_a_number_that_another_px4_has_is_left_to_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def instances_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(px4, "_SOCKET", str(tmp_path / "px4-{}"))
     monkeypatch.setattr(px4, "_CLAIM", str(tmp_path / "claim-{}"))
     monkeypatch.setattr(px4, "PORT", 45_600)
+
+
+@pytest.mark.usefixtures("instances_of_its_own")
+def test_a_number_that_another_px4_has_is_left_to_it(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
         other.bind(str(tmp_path / "px4-0"))
         other.listen()
@@ -167,12 +170,8 @@ def test_a_number_that_another_px4_has_is_left_to_it(
     assert link.port == 45_600
 
 
-def test_flights_in_networks_of_their_own_have_different_instances(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(px4, "_SOCKET", str(tmp_path / "px4-{}"))
-    monkeypatch.setattr(px4, "_CLAIM", str(tmp_path / "claim-{}"))
-    monkeypatch.setattr(px4, "PORT", 45_700)
+@pytest.mark.usefixtures("instances_of_its_own")
+def test_flights_in_networks_of_their_own_have_different_instances(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "claim-0")
     (tmp_path / "claim-1").symlink_to(tmp_path / "elsewhere")
     first = Px4Link.open(Sensors(1), ours=True)
