@@ -19,7 +19,7 @@ from sitl.autopilot.commander import (
     Snapshot,
     no_setpoint,
 )
-from sitl.autopilot.flight_modes import begin, climbs
+from sitl.autopilot.flight_modes import begin, climbs, touches_down
 from sitl.autopilot.parameters import TYPE_REAL32, Parameters
 from sitl.autopilot.telemetry import Link, Links
 from sitl.geodesy import Origin
@@ -28,8 +28,6 @@ from sitl.vehicle.truth import Truth
 
 COMPONENT = 1
 _PARAMETERS_A_TICK = 20  # about 1000 per second, as in PX4
-_STRAIGHT_DOWN_MPS = 0.3
-_STRAIGHT_DOWN_M = 0.5  # a place below the vehicle that is no farther away horizontally
 _TEXTS_A_TICK = 10  # further texts are dropped, so that bad messages cannot cause a flood of them
 
 
@@ -139,12 +137,8 @@ class Autopilot(Links):
         """True if a gentle ground contact now counts as a landing."""
         if self.commander.mode is not FlightMode.OFFBOARD:
             return True
-        north, east, down = self.snapshot.setpoint[3:6].tolist()
-        if math.hypot(north, east) < _STRAIGHT_DOWN_MPS and down > 0.0:
-            return True
-        place = self.snapshot.truth.position_ned_m
-        north, east, down = (self.snapshot.setpoint[:3] - place).tolist()
-        return bool(math.hypot(north, east) < _STRAIGHT_DOWN_M and down > 0.0)
+        now = self.snapshot
+        return touches_down(now.setpoint[:6].tolist(), now.truth.position_ned_m.tolist())
 
     def fly(self) -> None:
         """Run the active mode: set the setpoint and the motors until the next stamp."""

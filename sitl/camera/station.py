@@ -27,7 +27,7 @@ from mavfi_cli.link.endpoint import TWO_AUTOPILOTS, SenderSlot, parse_endpoint
 from mavfi_cli.link.peers import Peer, Peers
 from mavfi_cli.link.transport import Transport
 from sitl.camera.component import COMPONENT_ID, Camera
-from sitl.firmware.autopilot import follows_companion
+from sitl.firmware.autopilot import TouchdownWatch
 from sitl.referee import Collision, Referee
 from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.vehicle import regression_power
@@ -181,7 +181,7 @@ class Witness:
         self._world, self._profile, self._logs = world, profile, logs
         self._coefficients = profile.energy.coefficients(profile.extra_payload_kg)
         self._armed = self._on_ground = False
-        self._may_land = True
+        self._touchdown = TouchdownWatch()
         self._begin()
 
     def _begin(self) -> None:
@@ -194,12 +194,13 @@ class Witness:
         self._energy_j = 0.0
 
     def take(self, message: Any) -> None:
-        """Take arming, mode and landed state from a message of the autopilot."""
+        """Take arming, mode, landed state and setpoint from a message of the autopilot."""
+        self._touchdown.take(message)
         if isinstance(message, dialect.MAVLink_heartbeat_message):
             armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
             if armed and not self._armed:
                 self._begin()
-            self._armed, self._may_land = armed, not follows_companion(message)
+            self._armed = armed
         elif isinstance(message, dialect.MAVLink_extended_sys_state_message):
             self._on_ground = message.landed_state == _GROUND
 
@@ -220,7 +221,8 @@ class Witness:
         self._stamp_s = stamp_s
         return self._referee.observe(
             stamp_s, position_enu_m, quaternion_flu_enu, velocity,
-            armed=self._armed, on_ground=self._on_ground, may_land=self._may_land,
+            armed=self._armed, on_ground=self._on_ground,
+            may_land=self._touchdown.may_touch_ground,
             power_regression_w=power_w, power_propeller_w=np.nan,
         )  # fmt: skip
 

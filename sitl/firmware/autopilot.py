@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import os
 import re
 import signal
@@ -27,13 +28,17 @@ from mavfi_cli.link.codec import (
     text_messages,
 )
 from mavfi_cli.link.transport import Transport
+from sitl.autopilot.flight_modes import touches_down
 from sitl.autopilot.telemetry import Link, Links
 from sitl.camera.component import COMPONENT_ID as CAMERA
 from sitl.geodesy import Origin
 from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.truth import Truth
 
-_STREAMS_US = {**dict.fromkeys(STATE_STREAMS, 20_000.0), **SLOW_STREAMS_US}
+_STREAMS_US = {
+    **dict.fromkeys(STATE_STREAMS, 20_000.0), **SLOW_STREAMS_US,
+    dialect.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: 100_000.0,
+}  # fmt: skip
 _FOLLOWING = {  # mode in which each firmware follows a companion
     dialect.MAV_AUTOPILOT_PX4: 6 << 16,  # OFFBOARD
     dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: 4,  # GUIDED
@@ -43,9 +48,39 @@ _ECHO_LIMIT_S = 0.2
 _SILENCE_US = 60_000_000
 
 
-def follows_companion(heartbeat: Any) -> bool:
-    """Return True if a HEARTBEAT's mode is the one in which its autopilot follows a companion."""
-    return bool(heartbeat.custom_mode == _FOLLOWING.get(heartbeat.autopilot))
+class TouchdownWatch:
+    """Tells from an autopilot's messages whether a gentle ground contact counts as a landing.
+
+    It does unless the autopilot follows a companion to a place or with a velocity that does not
+    lead straight down.
+    """
+
+    def __init__(self) -> None:
+        self._follows = False
+        self._place = self._setpoint = (math.nan,) * 6  # NED, m and m/s
+
+    @property
+    def may_touch_ground(self) -> bool:
+        """True if a gentle ground contact now counts as a landing."""
+        return not self._follows or touches_down(self._setpoint, self._place[:3])
+
+    def take(self, message: Any) -> None:
+        """Take mode, position and setpoint from a message of the autopilot."""
+        if isinstance(message, dialect.MAVLink_heartbeat_message):
+            self._follows = message.custom_mode == _FOLLOWING.get(message.autopilot)
+        elif isinstance(message, dialect.MAVLink_local_position_ned_message):
+            self._place = _placed(message)
+        elif isinstance(message, dialect.MAVLink_position_target_local_ned_message):
+            mask = message.type_mask
+            self._setpoint = tuple(
+                math.nan if mask >> axis & 1 else value
+                for axis, value in enumerate(_placed(message))
+            )
+
+
+def _placed(message: Any) -> tuple[float, ...]:
+    """Return the position (3,) and the velocity (3,) of a message, m and m/s."""
+    return message.x, message.y, message.z, message.vx, message.vy, message.vz
 
 
 class FirmwareAutopilot(Links):
@@ -71,7 +106,7 @@ class FirmwareAutopilot(Links):
         self._transport = transport
         self._echoes = echoes
         self._codec = Codec(system_id, CAMERA)
-        self._follows = False
+        self._touchdown = TouchdownWatch()
         self._to_firmware: list[bytes] = []
         self._prepared = False
         self._heard_us = 0
@@ -112,11 +147,8 @@ class FirmwareAutopilot(Links):
 
     @property
     def may_touch_ground(self) -> bool:
-        """True if a gentle ground contact counts as a landing.
-
-        It does unless the firmware follows a companion.
-        """
-        return not self._follows
+        """True if a gentle ground contact now counts as a landing."""
+        return self._touchdown.may_touch_ground
 
     # The firmware.
 
@@ -167,12 +199,11 @@ class FirmwareAutopilot(Links):
             return
         header = message.get_header()
         if header.srcSystem == self.system_id and header.srcComponent == _AUTOPILOT:
+            self._touchdown.take(message)
             if number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
                 self.state_stamp_us = message.time_boot_ms * 1000
-            elif number == dialect.MAVLINK_MSG_ID_HEARTBEAT:
-                self._follows = follows_companion(message)
-                if not self._prepared:
-                    self._prepare()
+            elif number == dialect.MAVLINK_MSG_ID_HEARTBEAT and not self._prepared:
+                self._prepare()
         self.broadcast(message)
 
     def _prepare(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 
 import pytest
@@ -99,18 +100,42 @@ def test_a_client_speaks_under_its_own_ids(
     assert (heard.command, heard.param1) == (400, 1.0)
 
 
-def test_a_gentle_touchdown_counts_as_a_landing_unless_it_follows_a_companion(
-    wired: tuple[FirmwareAutopilot, socket.socket], resting: Truth
+def _target(mask: int, *place_and_velocity: float) -> bytes:
+    """Return a frame of PX4's POSITION_TARGET_LOCAL_NED."""
+    rest = 0.0, 0.0, 0.0, 0.0, 0.0
+    message = dialect.MAVLink_position_target_local_ned_message(
+        20, 1, mask, *place_and_velocity, *rest
+    )
+    return Codec(1, 1).encode(message)
+
+
+@pytest.mark.parametrize(
+    ("target", "lands"),
+    [
+        (_target(63, *[math.nan] * 6), False),
+        (_target(7, *[math.nan] * 3, 0.0, 0.0, 1.0), True),
+        (_target(7, *[math.nan] * 3, 0.0, 0.4, 1.0), False),
+        (_target(7, *[0.0] * 3, 0.0, 0.0, 0.0), False),
+        (_target(56, 4.3, 2.0, 0.0, 0.0, 0.0, 0.0), True),
+        (_target(56, 4.6, 2.0, 0.0, 0.0, 0.0, 0.0), False),
+        (_target(59, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), False),
+    ],
+)
+def test_a_gentle_touchdown_counts_as_a_landing_unless_a_companion_flies_on(
+    wired: tuple[FirmwareAutopilot, socket.socket], resting: Truth, target: bytes, *, lands: bool
 ) -> None:
     autopilot, theirs = wired
     theirs.sendall(PX4_HEARTBEAT)  # in AUTO.TAKEOFF
     autopilot.observe(20_000, resting)
     assert autopilot.may_touch_ground
-    theirs.sendall(
-        Codec(1, 1).encode(dialect.MAVLink_heartbeat_message(2, 12, 0x91, 6 << 16, 4, 3))
-    )
+    place = dialect.MAVLink_local_position_ned_message(20, 4.0, 2.0, -0.3, 0.0, 0.0, 0.0)
+    offboard = dialect.MAVLink_heartbeat_message(2, 12, 0x91, 6 << 16, 4, 3)
+    theirs.sendall(b"".join(map(Codec(1, 1).encode, (place, offboard))))
     autopilot.observe(40_000, resting)
     assert not autopilot.may_touch_ground
+    theirs.sendall(target)
+    autopilot.observe(60_000, resting)
+    assert autopilot.may_touch_ground is lands
 
 
 def test_a_collision_is_told_once_and_for_good(
