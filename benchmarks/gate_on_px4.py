@@ -50,11 +50,12 @@ def main() -> None:
 
 
 def _start(running: list[subprocess.Popen[bytes]], command: list[str], ready: str) -> None:
-    """Start a program, and wait until it has printed a text."""
+    """Start a program, and wait until it has printed a text. Exit if it does not in time."""
+    deadline_s = time.monotonic() + LIMIT_S
     with tempfile.NamedTemporaryFile() as said:
         running.append(subprocess.Popen(command, stdout=said, stderr=said, start_new_session=True))
         while ready not in Path(said.name).read_text():
-            if running[-1].poll() is not None:
+            if running[-1].poll() is not None or time.monotonic() > deadline_s:
                 sys.exit(Path(said.name).read_text())
             time.sleep(0.1)
 

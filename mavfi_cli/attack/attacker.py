@@ -12,13 +12,14 @@ import numpy as np
 from mavfi_cli.attack.place import Golden
 from mavfi_cli.attack.target import JudgedPlace, RunOutcome, RunVerdict
 from mavfi_cli.core.errors import TargetError
+from mavfi_cli.core.processes import Ended
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import InstructionFault, Rule, Strategy
 from mavfi_cli.fi.tracer.inject import NOTHING, Followed, Injection, reach, strike
 from mavfi_cli.fi.tracer.linux import ProcessTimer
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.fi.tracer.sampling import draw_fault_here
-from mavfi_cli.fi.tracer.tracee import Ended, Tracee
+from mavfi_cli.fi.tracer.tracee import Tracee
 
 GOLDEN_RUNS = 3
 _HIT_LIMIT_S = 1e-3  # allowed for one counted execution, about a hundred times what it takes

@@ -18,6 +18,7 @@ import numpy as np
 
 from mavfi_cli.attack.tracer_thread import Notice
 from mavfi_cli.core.errors import FaultSpecError
+from mavfi_cli.core.processes import Ended
 from mavfi_cli.fi.tracer import linux, record
 from mavfi_cli.fi.tracer.fault import FaultModel, InstructionFault, Rule, Strategy
 from mavfi_cli.fi.tracer.image import Image, Regions, Scope
@@ -32,7 +33,7 @@ from mavfi_cli.fi.tracer.inject import (
 )
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.fi.tracer.sampling import draw_fault_here
-from mavfi_cli.fi.tracer.tracee import Ended, Tracee, threads_of
+from mavfi_cli.fi.tracer.tracee import Tracee, threads_of
 from mavfi_cli.spec.fault import UNIFORM, InstructionConfig
 
 MOST_STEPS = 1000  # largest number of instructions from a moment to the fault

@@ -33,12 +33,13 @@ from mavfi_cli.attack.target import RunLimits, RunVerdict, judged, signal_name
 from mavfi_cli.attack.work_folder import WorkFolder
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.core.files import Json, ScratchFolder
+from mavfi_cli.core.processes import Ended
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.image import Image, Scope
 from mavfi_cli.fi.tracer.linux import ProcessTimer
 from mavfi_cli.fi.tracer.sampling import WindowTooLong
 from mavfi_cli.fi.tracer.spawn import ObservedRun, Program, run_to_entry, spawn, watch
-from mavfi_cli.fi.tracer.tracee import Ended, Mechanism, Tracee
+from mavfi_cli.fi.tracer.tracee import Mechanism, Tracee
 
 
 def _require_attackable(path: Path) -> None:

@@ -19,7 +19,7 @@ from mavfi_cli.attack.comparison import Difference
 from mavfi_cli.attack.place import AttackPlace, Golden, Watch
 from mavfi_cli.attack.profile import TargetProfile
 from mavfi_cli.core.files import Json
-from mavfi_cli.fi.tracer.tracee import Ended
+from mavfi_cli.core.processes import Ended
 
 
 class RunOutcome(Enum):

@@ -1,4 +1,4 @@
-"""Forks processes, sends values between them, and handles interrupts."""
+"""Forks processes, sends values between them, detects their end, and handles interrupts."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import io
 import operator
 import os
 import pickle
+import select
 import signal
 import socket
 import struct
@@ -26,6 +27,9 @@ PYTHON = (sys.executable, "-P")
 _LENGTH = 8
 _NEW_USER, _NEW_NETWORK = 0x1000_0000, 0x4000_0000  # unshare(2)
 _SET_FLAGS, _UP = 0x8914, 0x1  # netdevice(7)
+# PIDFD_GET_INFO of linux/pidfd.h: the number, the mask and the last field of `struct pidfd_info`,
+# and the bit of the mask for the status.
+_GET_INFO, _PIDFD_INFO, _INFO_EXIT = 0xC040_FF0B, struct.Struct("<Q52xi"), 1 << 3
 _libc = ctypes.CDLL(None)
 
 
@@ -175,3 +179,64 @@ def leave_network() -> bool:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
         fcntl.ioctl(any_socket, _SET_FLAGS, struct.pack("16sh22x", b"lo", _UP))
     return True
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Ended:
+    """How a process ended. At most one field is set, and none if the status is unknown."""
+
+    exit_code: int | None
+    signal: int | None
+
+    @classmethod
+    def of(cls, code: int) -> Ended:
+        """Convert an exit code as `subprocess` gives it, where a negative code is a signal."""
+        return cls(exit_code=None, signal=-code) if code < 0 else cls(exit_code=code, signal=None)
+
+    def describe(self) -> str:
+        """Describe in words, for a record, how the process ended."""
+        if self.signal is not None:
+            known = self.signal in signal.Signals.__members__.values()
+            return f"killed by {signal.Signals(self.signal).name if known else self.signal}"
+        return "ended" if self.exit_code is None else f"ended with code {self.exit_code}"
+
+
+class EndWatch:
+    """Detects the end of a process, which need not be a child (pidfd_open(2)).
+
+    Raises:
+        ProcessLookupError: The process does not exist.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self._pid, self._descriptor = pid, os.pidfd_open(pid)
+        self._poller = select.poll()
+        self._poller.register(self._descriptor, select.POLLIN)
+
+    def look(self) -> Ended | None:
+        """Return how the process ended, or None if it still runs.
+
+        Before Linux 6.15, the exit status is unknown if the process has already been reaped.
+        """
+        if not self._poller.poll(0):
+            return None
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            stat = Path(f"/proc/{self._pid}/stat").read_text()
+            state, *_, status = stat.rpartition(")")[2].split()  # field 52, proc_pid_stat(5)
+            if state == "Z":  # else another process has reused its id
+                return Ended.of(os.waitstatus_to_exitcode(int(status)))
+        return self._reaped()
+
+    def _reaped(self) -> Ended:
+        """Return how the process ended that has been reaped, if the kernel still knows it."""
+        info = bytearray(_PIDFD_INFO.pack(_INFO_EXIT, 0))
+        with contextlib.suppress(OSError):
+            fcntl.ioctl(self._descriptor, _GET_INFO, info)
+            known, status = _PIDFD_INFO.unpack(info)
+            if known & _INFO_EXIT:
+                return Ended.of(os.waitstatus_to_exitcode(status))
+        return Ended(exit_code=None, signal=None)
+
+    def close(self) -> None:
+        """Stop watching the process."""
+        os.close(self._descriptor)

@@ -57,7 +57,8 @@ class TouchdownWatch:
 
     def __init__(self) -> None:
         self._follows = False
-        self._place = self._setpoint = (math.nan,) * 6  # NED, m and m/s
+        self._place: tuple[float, ...] = (math.nan,) * 6  # NED, m and m/s
+        self._setpoint: tuple[float, ...] = self._place
 
     @property
     def may_touch_ground(self) -> bool:

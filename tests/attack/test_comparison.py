@@ -14,8 +14,8 @@ from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.attack.target import RunOutcome
 from mavfi_cli.cli.kernels import kernels
 from mavfi_cli.core.errors import ConfigError, TargetError
+from mavfi_cli.core.processes import Ended
 from mavfi_cli.fi.tracer.spawn import Program
-from mavfi_cli.fi.tracer.tracee import Ended
 
 
 @pytest.fixture

@@ -29,9 +29,9 @@ from mavfi_cli.attack.target import RunLimits, RunOutcome, RunVerdict, judged
 from mavfi_cli.core.compiled import own_digest
 from mavfi_cli.core.errors import FaultError, TargetError
 from mavfi_cli.core.files import Json
-from mavfi_cli.core.processes import receive
+from mavfi_cli.core.processes import Ended, receive
 from mavfi_cli.fi.tracer.image import Image, Scope
-from mavfi_cli.fi.tracer.tracee import Ended, Mechanism, Tracee
+from mavfi_cli.fi.tracer.tracee import Mechanism, Tracee
 
 _PROGRAM = "mavfi_cli.attack.kernels.template"
 

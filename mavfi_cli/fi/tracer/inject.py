@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from enum import Enum
 
 from mavfi_cli.core.errors import FaultError
+from mavfi_cli.core.processes import Ended
 from mavfi_cli.fi import bits
 from mavfi_cli.fi.tracer.decode import Instruction, decode
 from mavfi_cli.fi.tracer.fault import InstructionCorruption, InstructionFault, Role, Site
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.registers import TRAP_FLAG, VECTOR_BITS, width_of
-from mavfi_cli.fi.tracer.tracee import Ended, Tracee
+from mavfi_cli.fi.tracer.tracee import Tracee
 
 
 class BitActivation(Enum):

@@ -14,12 +14,12 @@ from mavfi_cli.attack.tracer_thread import TracerThread
 from mavfi_cli.companion.injection import Killer
 from mavfi_cli.core.errors import MavfiError, described
 from mavfi_cli.core.flight_record import NodeCrash, NodeEnds, Strike
+from mavfi_cli.core.processes import Ended, EndWatch
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.injector import Moment
 from mavfi_cli.fi.tracer import record, stepper
 from mavfi_cli.fi.tracer.inject import NOTHING
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
-from mavfi_cli.fi.tracer.tracee import Ended, EndWatch
 from mavfi_cli.mission.companion_faults import CompanionFault
 from mavfi_cli.mission.programs import RunningProgram
 from mavfi_cli.spec.fault import InstructionConfig

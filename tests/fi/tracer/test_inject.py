@@ -5,12 +5,12 @@ import signal
 import pytest
 from native_programs import register_corruption
 
+from mavfi_cli.core.processes import Ended
 from mavfi_cli.fi.tracer.counted import CountedStop
 from mavfi_cli.fi.tracer.decode import decode
 from mavfi_cli.fi.tracer.fault import InstructionCorruption, InstructionFault, Role, Site
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import BitActivation, instruction_at, strike
-from mavfi_cli.fi.tracer.tracee import Ended
 
 
 def stop_at(start, label):

@@ -12,12 +12,13 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.core.errors import TargetError
+from mavfi_cli.core.processes import Ended
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
 from mavfi_cli.fi.tracer.linux import ProcessTimer
 from mavfi_cli.fi.tracer.spawn import Program, spawn
-from mavfi_cli.fi.tracer.tracee import Ended, ExecutionCounter, Mechanism, Tracee
+from mavfi_cli.fi.tracer.tracee import ExecutionCounter, Mechanism, Tracee
 
 
 def entry(tracee, program, function):

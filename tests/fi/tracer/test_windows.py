@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.errors import FaultError, UnknownName
+from mavfi_cli.core.processes import Ended
 from mavfi_cli.fi.tracer.fault import FaultModel, Site, Strategy
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
@@ -18,7 +19,7 @@ from mavfi_cli.fi.tracer.sampling import (
     draw_fault,
     record_window,
 )
-from mavfi_cli.fi.tracer.tracee import Ended, ExecutionCounter, Mechanism
+from mavfi_cli.fi.tracer.tracee import ExecutionCounter, Mechanism
 
 
 def profile_of(start, name, *arguments, limit=100_000, reads_own_code=True):
