@@ -40,6 +40,7 @@ from mavfi_cli.core.errors import (
     VehicleProcessError,
 )
 from mavfi_cli.core.files import reading, write_text
+from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.companion_faults import check_companion_fault
 from mavfi_cli.mission.vehicle import VehicleInProcess
 from mavfi_cli.spec.companion import CompanionConfig
@@ -495,16 +496,21 @@ def _search(
             for flight in range(rule.flights)
         ]
         with run_campaign(planned, folder, options, spectator, append=True) as ledger:
-            pilots = {result.mission.config: result.flight.pilot for result in ledger.results()}
+            pilots = {
+                result.mission.config: result.flight.pilot
+                for result in ledger.results()
+                if result.outcome == Outcome.SUCCESS.value
+            }
         for seed in seeds:
-            own = (
-                pilots[mission.config] for mission in planned if mission.config.world_seed == seed
-            )
+            configs = (mission.config for mission in planned)
+            own = (pilots.get(config) for config in configs if config.world_seed == seed)
             flown = (*flown, tuple(pilot.replans for pilot in own if pilot is not None))
             if rule.fits(flown[-1]):
                 return flown[:seed]
     often = sorted(itertools.chain.from_iterable(flown))
     seen = f"; the flights replanned {often[0]} to {often[-1]} times" if often else ""
+    if lost := sum(not rule.succeeds(replans) for replans in flown):
+        seen += f"; in {lost} of these worlds at least half of the golden flights failed"
     assert rule.replans is not None
     least, most = rule.replans
     raise ConfigError(

@@ -46,10 +46,11 @@ from mavfi_cli.campaigns.workers import (
 from mavfi_cli.core.errors import ConfigError, Interrupted
 from mavfi_cli.core.files import file_digest, own_folder, sync_folder, writing
 from mavfi_cli.core.installed import installed_versions, version_differences
-from mavfi_cli.core.processes import interruptible
+from mavfi_cli.core.processes import interruptible, may_leave_network
 from mavfi_cli.mission.instruction import CACHE, kept_in
 from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.mission.run_folder import RESULT
+from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.strata import weighted_share
 
@@ -415,6 +416,7 @@ class _Run:
             wanted, stop, cells, over(), shares=shares, drawn=drawn, stopped=stopped
         )
         self._again: list[MissingMission] = []
+        self._checks_network = self._jobs > 1 and options.cluster is None
         self._alone: dict[int, str] = {}  # reasons why missions do not share a flight
         self._flying: dict[int, MissingMission] = {}
         self._attempts: Counter[int] = Counter()
@@ -484,6 +486,7 @@ class _Run:
             for mission in missions:
                 number, _, config = mission
                 config.require_programs(*self._options.programs)
+                self._note_shared_network(config)
                 self._attempts[number] += 1
                 self._flying[number] = mission
                 attempts.append((number, changes_of(config), self._made(number)))
@@ -498,6 +501,17 @@ class _Run:
         left = self._total - self._over - len(self._flying)
         most = min(SHARING, math.ceil(left / self._jobs))  # so that the last flights end together
         return [mission, *self._queue.mates(mission, most - 1)]
+
+    def _note_shared_network(self, config: MissionConfig) -> None:
+        """Tell the user, once, if missions of a user's companion must share this network."""
+        if not self._checks_network or config.companion is None:
+            return
+        self._checks_network = False
+        if CompanionConfig.load(config.companion).own_network and not may_leave_network():
+            self._spectator.on_note(
+                "no network namespaces are allowed here, so missions share the machine's ports: "
+                "a companion with a fixed port needs --jobs 1"
+            )
 
     def _note_unforked(self, over: Sequence[AttemptEnd]) -> None:
         """Remember which missions could not be forked, and why, so that they are flown alone."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import queue
 import selectors
 import shutil
@@ -17,7 +18,7 @@ import threading
 import time
 import uuid
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -537,8 +538,14 @@ def _packed(place: Path, number: int, keep: Keep) -> dict[str, bytes]:
     whole = keep.wants(number, outcome)
     return {
         str(path.relative_to(place)): zlib.compress(path.read_bytes(), 1)
-        for path in sorted(place.glob("[!.]*/*")) + sorted(place.glob("[!.]*"))
-        if path.is_file()
-        and path.parent.name != SCRATCH
-        and (whole or path.name in _SMALL or path.parent == place)
+        for path in _files(place)
+        if whole or path.name in _SMALL or path.parent == place
     }
+
+
+def _files(place: Path) -> Iterator[Path]:
+    """Yield the regular files of an attempt, except those in its scratch or hidden folders."""
+    for folder, folders, files in os.walk(place):
+        folders[:] = sorted(n for n in folders if n != SCRATCH and not n.startswith("."))
+        paths = (Path(folder, name) for name in sorted(files))
+        yield from (path for path in paths if not path.is_symlink())

@@ -39,7 +39,7 @@ from mavfi_cli.mission.programs import Programs
 from mavfi_cli.mission.progress import FlightLogger, FlightProgress, Watcher
 from mavfi_cli.mission.run_folder import RunFolder, Trace, load_run
 from mavfi_cli.mission.setpoint_gate import SetpointGate
-from mavfi_cli.mission.setpoints import command_of
+from mavfi_cli.mission.setpoints import SETPOINTS, Commanders, command_of
 from mavfi_cli.mission.success import SuccessVerdict
 from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
@@ -49,7 +49,6 @@ _SERVE_S = 0.02  # longest time to serve the links in a turn
 _HEARTBEATS_S = 2.0  # time in which a heartbeat reports that the vehicle is armed
 _BOOT_S = 60.0  # simulated time after which programs start even if the vehicle cannot arm yet
 _SILENCE_S = 60.0  # wall-clock time without a message after which the vehicle counts as lost
-_MOST_EVENTS = 1000
 _NO_SYSTEM = 255  # target of a setpoint that ends a tick and commands nothing
 _NO_TARGET = (0x0FFF, *[0.0] * 11)  # type mask that ignores all fields, and the fields
 _POSITION = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
@@ -93,7 +92,7 @@ class CompanionFlight:
         self._heard_s = time.monotonic()
         self._command: Command | None = None
         self._gate = self._planned_gate()
-        self._commanders: set[tuple[int, int]] = set()
+        self._commanders = Commanders()
         self._ticks = 0  # since the first arming
         self._mode, self._failsafe = "", False
         self._failsafe_in_air = False  # in command when the vehicle was last in the air
@@ -317,15 +316,11 @@ class CompanionFlight:
         """Handle a message from the companion's side."""
         if isinstance(message, dialect.MAVLink_heartbeat_message):
             self._crew.hear(message.get_srcSystem(), message.get_srcComponent())
-        if message.get_msgId() != _SETPOINT:
+        if message.get_msgId() not in SETPOINTS:
             return
-        sender = message.get_srcSystem(), message.get_srcComponent()
-        if sender not in self._commanders and len(self._commanders) < _MOST_EVENTS:
-            self._commanders.add(sender)
-            if len(self._commanders) > 1:
-                text = f"another commander, {sender[0]}/{sender[1]}, sends setpoints"
-                self.logger.note(self.stamp_s, "program", text, self.telemetry.state)
-        if self.telemetry.state is not None:
+        if text := self._commanders.another(message):
+            self.logger.note(self.stamp_s, "program", text, self.telemetry.state)
+        if message.get_msgId() == _SETPOINT and self.telemetry.state is not None:
             self._command = command_of(message, self.telemetry.state)
 
     # The end --------------------------------------------------------------------------------------

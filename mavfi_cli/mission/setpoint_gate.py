@@ -20,14 +20,14 @@ from mavfi_cli.core.types import Command, StackMark, Stage, Trajectory
 from mavfi_cli.detect.gate import Alarm, Gate
 from mavfi_cli.link.codec import Codec, Message, Signing, dialect, frame_of, renewed, text_messages
 from mavfi_cli.link.router import Side
-from mavfi_cli.mission.setpoints import SETPOINTS, SetpointView
+from mavfi_cli.mission.setpoints import SETPOINTS, Commanders, SetpointView
 from mavfi_cli.spec.companion import GateConfig
 from mavfi_cli.spec.detector import DetectorConfig
 
 _COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER4  # sender of the gate's own messages
 _SILENT_S = 3.0  # wall-clock time without a heartbeat after which its sender is gone
 _TEXT_EVERY_S = 1.0
-_MOST_ALARMS = 100
+_MOST_ALARMS, _MOST_STREAMS = 100, 16
 _BRAKE = 0b1101_1100_0111  # type_mask of a velocity-only setpoint
 
 
@@ -86,8 +86,9 @@ class SetpointGate:
         self._noted_s = self._handed_s = -math.inf
         self._silent_s = _SILENT_S * speed
         self._heartbeats: dict[tuple[int, int], float] = {}  # newest, by system and component
-        self._same: tuple[Any, ...] = ()
-        self._same_since_s = -math.inf
+        # Newest setpoint and the time since which it is the same, by sender and message id.
+        self._steady: dict[tuple[int, int, int], tuple[tuple[str, ...], float]] = {}
+        self._commanders = Commanders()
         self._failed = False
         self.outbox: list[bytes] = []
 
@@ -126,6 +127,8 @@ class SetpointGate:
             return [message] if passes else []
 
     def _judge(self, message: Message, now_s: float) -> list[Message]:
+        if text := self._commanders.another(message):
+            self._say(text, math.inf)
         if why := self._staleness(message, now_s):
             if self._settings.watch_only:
                 self._counts.none += 1
@@ -166,20 +169,22 @@ class SetpointGate:
     def _staleness(self, message: Message, now_s: float) -> str:
         """Return why a setpoint is stale, or an empty string if it is not.
 
-        Setpoints are stale if they no longer change, and the companion is gone or the sender of the
-        setpoint sends no more heartbeats.
+        Setpoints are stale if their sender no longer changes them, and the companion is gone or
+        this sender sends no more heartbeats.
         """
-        content = tuple(
-            getattr(message, name) for name in message.fieldnames if name != "time_boot_ms"
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        content = tuple(  # as text, because NaN differs from itself
+            repr(getattr(message, name)) for name in message.fieldnames if name != "time_boot_ms"
         )
-        content = (message.get_msgId(), *map(repr, content))  # NaN equals itself
-        if content != self._same:
-            self._same, self._same_since_s = content, now_s
-        if now_s - self._same_since_s < self._settings.stale_s:
+        stream = (*sender, message.get_msgId())
+        before, since_s = self._steady.pop(stream, (None, now_s))
+        self._steady[stream] = content, since_s if content == before else now_s
+        if len(self._steady) > _MOST_STREAMS:
+            del self._steady[next(iter(self._steady))]  # the one that has been silent longest
+        if now_s - self._steady[stream][1] < self._settings.stale_s:
             return ""
         if why := self._gone():
             return why
-        sender = message.get_srcSystem(), message.get_srcComponent()
         silent = now_s - self._heartbeats.get(sender, now_s) > self._silent_s
         return "the companion's heartbeat is gone" if silent else ""
 

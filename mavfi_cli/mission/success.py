@@ -96,13 +96,14 @@ class SuccessVerdict:
             self._rests = state.stamp_s - self._rest_since_s >= _REST_S
 
     def describe(self) -> str:
-        """Describe the conditions of success that are configured."""
+        """Describe the configured conditions of success, and whether there was a flight."""
         success = self._success
         parts = (
             "" if success.goal_m is None else f"at rest within {success.goal_m:g} m of the goal",
             "landed" if success.landed else "",
             "" if success.exit is None else f"{success.exit} ended with code 0",
             "" if success.corridor_m is None else f"within {success.corridor_m:g} m of the path",
+            "" if self.flew else "without a flight",
         )
         return ", ".join(filter(None, parts))
 

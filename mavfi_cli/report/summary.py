@@ -261,8 +261,9 @@ def _fault_lines(flight: FlightRecord) -> list[str]:
     place = _MESSAGES.get(fault.stage, f"{fault.stage} stage,")
     what = f"{place} {states}: {request['persistence']} {request['effect']}"
     if fault.stage == "process":
-        struck = {"flip": "is killed", "stop": "is stopped"}
-        what = f"{states} {struck.get(request['effect'], request['effect'])}"
+        effect, _, share = request["effect"].partition("=")
+        struck = {"flip": "is killed", "stop": "is stopped", "slow": f"is slowed to {share}"}
+        what = f"{states} {struck[effect]}"
     lines = [f"Fault       {what}, {when}"]
     if fault.state == "not_injected":
         lines.append(f"            not injected: {fault.reason}")

@@ -70,6 +70,8 @@ def record(changes, seed, world, value):
     outcome = value if world == "end" else "success"
     if world == "fragile" and harmful(changes):
         outcome = "collision"
+    if world == "doomed" and changes.get("world_seed") in {2, 5} and seed > 1:
+        outcome = "collision"
     return {
         "schema": 1,
         "outcome": outcome,
@@ -101,5 +103,6 @@ def harmful(changes):
 
 
 def replans(changes, world, drawn):
-    """In `rising` as often as the world's seed says, in `flat` never; elsewhere as drawn."""
-    return {"rising": changes.get("world_seed", 0), "flat": 0}.get(world, drawn)
+    """In `flat` never, in `rising` and `doomed` as the world's seed says; elsewhere as drawn."""
+    seed = changes.get("world_seed", 0)
+    return {"rising": seed, "doomed": seed, "flat": 0}.get(world, drawn)

@@ -314,3 +314,17 @@ def test_real_flights_are_the_same_on_a_cluster_whose_worker_leaves_no_folder_be
             result = json.loads(files["result.json"])
             files["result.json"] = {k: v for k, v in result.items() if k != "host"}
     assert far == local
+
+
+@pytest.mark.slow
+def test_a_users_companion_flies_on_a_worker(cluster, mavfi, tmp_path):
+    (tmp_path / "looks.toml").write_text("[program.looks]\ncommand = 'echo {start}'\n")
+    spec = tmp_path / "looking.toml"
+    companion = tmp_path / "looks.toml"  # an absolute path: the worker runs in another folder
+    spec.write_text(f"[mission]\ncompanion = '{companion}'\nworld = 'farm'\n[[setting]]\n")
+    cluster.worker()
+    options = ("--keep", "all", "--cluster", cluster.address)
+    run = mavfi("campaign", "run", spec, "--out", tmp_path / "far", *options)
+    assert run.returncode == 0, run.stderr
+    [said] = (tmp_path / "far" / "runs").glob("*/programs/looks/stdout")
+    assert said.read_text().count(",") == 2

@@ -168,6 +168,18 @@ def test_a_candidate_whose_flights_could_not_begin_does_not_fit():
     assert not rule.fits(())
 
 
+def test_a_world_in_which_golden_flights_fail_is_not_chosen(begun):
+    rule, _ = begun(spec_of(SPEC.replace("rising", "doomed")))
+    assert rule.world_seed == {"doomed": 6}
+    assert rule.flown["doomed"][4] == (5,)  # two of three golden flights have failed
+
+
+def test_an_error_tells_in_how_many_worlds_golden_flights_fail(begun):
+    never = SPEC.replace("rising", "doomed").replace("[5, 6]", "[20, 21]")
+    with pytest.raises(ConfigError, match="in 2 of these worlds at least half of the golden"):
+        begun(spec_of(never))
+
+
 def test_boxes_of_a_user_are_one_world_already():
     rule = FixedWorld(replans=(0, 9))
     assert (rule.rules("dense"), rule.rules("mine.toml")) == (True, False)

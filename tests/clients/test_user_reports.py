@@ -18,6 +18,7 @@ from mavfi_cli.detect.offline import Dataset, FlightSamples
 from mavfi_cli.detect.preprocess import PreprocessParams
 from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.detector import DetectorConfig
+from mavfi_cli.spec.fault import InstructionConfig
 
 SCRIPT = Path(__file__).with_name("mavsdk_offboard.py")
 
@@ -29,7 +30,7 @@ def fly(request, tmp_path):
         pytest.skip("PX4_SITL names no PX4")
     path = tmp_path / "script.toml"
 
-    def flown(fault, *, threshold=None, time_limit_s=25.0):
+    def flown(fault, *, threshold=None, time_limit_s=25.0, instruction=None):
         path.write_text(
             f"[program.script]\ncommand = '{sys.executable} {SCRIPT} {{mavsdk}} {{free}}'\n"
             f"environment = {{ FAULT = '{fault}', WILD_S = '3' }}\n[success]\nlanded = true\n"
@@ -43,7 +44,7 @@ def fly(request, tmp_path):
             )
         return library.fly(
             companion=str(path), world="farm", seed=1, time_limit_s=time_limit_s, out=tmp_path,
-            autopilot=request.param, detector=detector,
+            autopilot=request.param, detector=detector, instruction=instruction,
         )  # fmt: skip
 
     return flown
@@ -85,6 +86,16 @@ def test_the_gate_withholds_a_wild_setpoint(fly):
     assert guarded.record.outcome == "success"
     assert fastest_mps(guarded) < 3.0
     assert guarded.record.detection.alarm_count >= 1
+
+
+@pytest.mark.slow
+def test_an_instruction_of_the_server_is_struck(fly):
+    fault = InstructionConfig(target="script/mavsdk_server", at="time=3", seed=2)
+    record = fly("", time_limit_s=60.0, instruction=fault).record
+    assert record.outcome in ("success", "crash", "failsafe", "timeout")
+    assert record.instruction_fault.state == "applied"
+    assert record.instruction_fault.node == "script"
+    assert record.instruction_fault.object
 
 
 def fastest_mps(run):

@@ -5,17 +5,20 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from mavfi_cli import library
+from mavfi_cli.campaigns import run as runner
 from mavfi_cli.campaigns.missions import PlannedMission
+from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ConfigError, MavfiError, RecordError
 from mavfi_cli.core.flight_record import ProgramEnds
-from mavfi_cli.core.processes import fork, leave_network
+from mavfi_cli.core.processes import may_leave_network
 from mavfi_cli.link.codec import Codec
 from mavfi_cli.mission.crew import Crew
 from mavfi_cli.mission.run import fly_again
@@ -111,6 +114,35 @@ def test_the_end_of_a_program_is_seen_while_the_vehicle_lands(fly):
 def test_a_vehicle_that_stands_near_the_goal_has_not_reached_it(fly):
     run = fly("waits", success="goal_m = 50.0", limit_s=3.0, goal=(10.0, 6.0, 5.0))
     assert run.record.outcome == "timeout"
+
+
+@pytest.mark.slow
+def test_a_vehicle_at_rest_near_the_goal_has_reached_it(fly):
+    run = fly("lands", success="goal_m = 4.0", start=(2.0, 2.0, 0.0), goal=(2.0, 10.0, 2.0))
+    assert run.record.outcome == "success"
+    assert run.record.reason == "at rest within 4 m of the goal"
+    assert run.trace["y_m"].to_numpy()[-1] > 6.0
+
+
+@pytest.mark.slow
+def test_a_program_starts_once_the_port_of_the_one_before_is_open(fly, free_port):
+    serve = f"{sys.executable} -m http.server {free_port} --bind 127.0.0.1"
+    run = fly("lands", top=f"[program.server]\ncommand = '{serve}'\nready_port = {free_port}\n")
+    assert run.record.outcome == "success"
+    assert run.record.programs["hop"] == ProgramEnds(starts=1)
+    assert "GET" not in (run.folder.programs / "server" / "stderr").read_text()
+
+
+@pytest.mark.slow
+def test_the_spread_of_golden_flights_is_printed(fly, mavfi, tmp_path):
+    fly("waits", limit_s=3.0)  # writes the companion's file
+    companion = tmp_path / "hop.toml"
+    companion.write_text(companion.read_text().replace("waits", "lands"))
+    line = ["fly", "--companion", companion, "--world", "farm", "--speed", SPEED]
+    run = mavfi(*line, "--golden", 2, "--out", tmp_path / "golden", "--no-picture")
+    assert run.returncode == 0, run.stderr
+    assert "success 2, of 2" in run.stdout
+    assert len(list((tmp_path / "golden").glob("farm-*"))) == 2
 
 
 @pytest.mark.slow
@@ -275,13 +307,28 @@ def test_the_port_of_another_program_is_told(tmp_path):
             library.fly(companion=str(path), world="farm", out=tmp_path)
 
 
-def is_allowed():
-    pid = fork(lambda: 0 if leave_network() else 1)
-    return os.waitpid(pid, 0)[1] == 0
+class Notes(Spectator):
+    """Keeps what a campaign tells its user."""
+
+    texts: ClassVar[list[str]] = []
+
+    def on_note(self, text):
+        self.texts.append(text)
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not is_allowed(), reason="no network namespaces here")
+def test_a_machine_without_network_namespaces_is_told_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "may_leave_network", lambda: False)
+    monkeypatch.setattr(Notes, "texts", [])
+    config = MissionConfig(companion="true", world="farm", speed=SPEED)
+    missions = [PlannedMission(config=replace(config, seed=seed)) for seed in (1, 2)]
+    run_campaign(missions, tmp_path / "campaign", Options(jobs=2), Notes()).close()
+    [told] = Notes.texts
+    assert told.endswith("a companion with a fixed port needs --jobs 1")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not may_leave_network(), reason="no network namespaces here")
 @pytest.mark.parametrize("own", [True, False])
 def test_missions_of_a_campaign_have_networks_of_their_own(tmp_path, own):
     companion, here = tmp_path / "looks.toml", os.readlink("/proc/self/ns/net")
@@ -290,8 +337,9 @@ def test_missions_of_a_campaign_have_networks_of_their_own(tmp_path, own):
     config = MissionConfig(companion=str(companion), world="farm", speed=SPEED)
     missions = [PlannedMission(config=replace(config, seed=seed)) for seed in (1, 2)]
     options = Options(jobs=2, keep=Keep.ALL)
-    with run_campaign(missions, tmp_path / "campaign", options) as ledger:
+    with run_campaign(missions, tmp_path / "campaign", options, Notes()) as ledger:
         results = list(ledger.results())
+    assert Notes.texts == []
     assert [row.outcome for row in results] == ["success", "success"]
     networks = [(row.path / "programs/looks/stdout").read_text().strip() for row in results]
     assert len({here, *networks}) == (3 if own else 1)

@@ -204,6 +204,27 @@ def test_setpoints_of_a_companion_that_is_gone_end_once_they_no_longer_change(ga
     assert velocities(silent, [2.0] * 35) == [[2.0]] * 30 + [[]] * 5
 
 
+def test_setpoints_of_a_gone_companion_end_beside_those_of_another_commander(gate):
+    own = gate(gone=lambda: "the program script is gone")
+    passed = []
+    for tick in range(1, 13):
+        for component, vx in ((191, 2.0), (190, 0.1 * tick)):
+            now_s = 1.0 + 0.1 * tick
+            message = received(setpoint(vx), component=component)
+            passed.append([m.vx for m in own.pass_between(message, Side.COMPANION, now_s)])
+    assert passed[::2] == [[2.0]] * 9 + [[]] * 3
+    assert all(passed[1::2])
+    assert own.said[0] == "another commander, 1/190, sends setpoints"
+
+
+def test_a_flood_of_senders_fills_no_memory(gate):
+    own = gate()
+    for system in range(1, 251):
+        own.pass_between(received(setpoint(2.0), system=system), Side.COMPANION, 1.0)
+    assert len(own._steady) == 16
+    assert sum("another commander" in text for text in own.said) == 99
+
+
 @pytest.mark.parametrize(("on_error", "passed"), [("open", [[2.0]]), ("closed", [[]])])
 def test_an_error_in_the_gate_fails_as_configured(gate, on_error, passed):
     own = gate(on_error=on_error)
