@@ -83,12 +83,16 @@ def main() -> None:
     apart = [float(np.mean(each[last]) - np.mean(each[first])) for each in whole.values()]
     print(f"all five factors together: {text(interval(100.0 * np.array(apart)), '+')} points")
 
-    effects, tests, by_seed = [], [], []
+    effects, tests, by_seed, in_worlds = [], [], [], []
     for place in range(len(FACTORS)):
         changes = {where: change(block, place) for where, block in whole.items()}
         effects.append(interval(100.0 * np.array([*changes.values()])))
         tests.append(sign_flips([*changes.values()]))
         by_seed.append(sign_flips(of_seeds(changes)))
+        own: dict[str, list[float]] = collections.defaultdict(list)
+        for (world, _), points in changes.items():
+            own[world].append(100.0 * points)
+        in_worlds.append({world: interval(np.array(points)) for world, points in own.items()})
     print("\n| factor | from | to | points | share of the paper's loss | p | p by seed |")
     print("|---" * 7 + "|")
     rows = zip(FACTORS.items(), effects, holm(tests), holm(by_seed), strict=True)
@@ -97,6 +101,10 @@ def main() -> None:
             f"| {name} | {' | '.join(ends)} | {text(effect, '+')} | "
             f"{effect.value / PAPER_POINTS:.0%} | {p:.2g} | {p_seeds:.2g} |"
         )
+
+    print(f"\n| factor | {' | '.join(in_worlds[0])} |\n" + "|---" * (1 + len(in_worlds[0])) + "|")
+    for name, by_world in zip(FACTORS, in_worlds, strict=True):
+        print(f"| {name} | {' | '.join(text(effect, '+') for effect in by_world.values())} |")
 
     print("\n| " + " | ".join(names := ["worlds", "dead nodes", "injector"]) + " | lost | % |")
     print("|---" * 5 + "|")
