@@ -1,5 +1,6 @@
 """Faults in the messages and processes of a user's companion."""
 
+import errno
 import json
 import os
 import signal
@@ -14,6 +15,7 @@ from mavfi_cli import library
 from mavfi_cli.cli.fly import _TOO_SHORT
 from mavfi_cli.core.errors import FaultSpecError, MavfiError, UnknownName
 from mavfi_cli.fi.injector import Moment
+from mavfi_cli.fi.tracer import linux
 from mavfi_cli.link.codec import Codec, Signing, dialect, frame_of, key_from_passphrase
 from mavfi_cli.link.router import Side
 from mavfi_cli.mission.companion_faults import (
@@ -24,7 +26,7 @@ from mavfi_cli.mission.companion_faults import (
 from mavfi_cli.mission.programs import Programs, Throttle
 from mavfi_cli.report.summary import summary_lines
 from mavfi_cli.spec.companion import CompanionConfig, ProgramConfig
-from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
 HOP = Path(__file__).with_name("hop.py")
 SETPOINT = "SET_POSITION_TARGET_LOCAL_NED"
@@ -278,6 +280,28 @@ def test_an_instruction_of_a_program_is_struck_in_flight_and_struck_again(tmp_pa
     first, again = ((fault["object"], fault["offset"], fault["corruption"]) for fault in faults)
     assert first == again
     assert not first[0].startswith(("python", "libpython"))
+
+
+@pytest.mark.slow
+def test_without_permission_to_trace_a_flight_tells_the_remedy(tmp_path, monkeypatch):
+    def refused(*_arguments):
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+    monkeypatch.setattr(linux, "request", refused)
+    companion = tmp_path / "hop.toml"
+    companion.write_text(
+        f"[program.hop]\ncommand = '{sys.executable} -u {HOP} {{link}} 4 lands'\n"
+        "[success]\nlanded = true\n"
+    )
+    run = library.fly(
+        companion=str(companion), world="farm", speed=4.0, time_limit_s=60.0, out=tmp_path,
+        instruction=InstructionConfig(target="hop", at="time=4"),
+    )  # fmt: skip
+    assert run.record.outcome == "success"
+    fault = run.record.instruction_fault
+    assert fault.state == "not_injected"
+    assert "Operation not permitted" in fault.reason
+    assert "ptrace" in fault.reason
 
 
 @pytest.mark.parametrize(

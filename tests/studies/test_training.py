@@ -3,6 +3,8 @@
 import json
 import re
 import shutil
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -135,3 +137,25 @@ def test_what_would_be_flown_means_nothing_with_flown(mavfi, flown):
     done = mavfi("train", "--flown", flown, "--flights", "30")
     assert done.returncode == 2
     assert re.fullmatch("error: --flights .* --flown\n", done.stderr)
+
+
+@pytest.mark.slow
+def test_a_model_of_a_users_companion_guards_its_flights(mavfi, tmp_path):
+    program = Path(__file__).parents[2] / "examples" / "companions" / "lockstep.py"
+    companion = tmp_path / "north.toml"
+    companion.write_text(
+        f"time = 'lockstep'\n[program.north]\ncommand = '{sys.executable} {program} {{link}}'\n"
+        "[success]\nlanded = true\n"
+    )
+    out = tmp_path / "gate"
+    line = ["train", "--companion", companion, "--world", "farm", "--flights", 10]
+    done = mavfi(*line, "--kind", "range", "--out", out, "--quiet")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((out / "range.json").read_text())["stack"]["name"] == "companion:north"
+    line = ["fly", "--companion", companion, "--world", "farm", "--detector", "range"]
+    line += ["--model", out / "range.json", "--no-picture", "--quiet", "--json"]
+    done = mavfi(*line, "--out", tmp_path / "runs")
+    result = json.loads(done.stdout)
+    assert result["outcome"] == "success"
+    assert result["detection"]["checks"]["setpoint"] > 100
+    assert result["detection"]["alarm_count"] == 0
