@@ -548,4 +548,4 @@ def _files(place: Path) -> Iterator[Path]:
     for folder, folders, files in os.walk(place):
         folders[:] = sorted(n for n in folders if n != SCRATCH and not n.startswith("."))
         paths = (Path(folder, name) for name in sorted(files))
-        yield from (path for path in paths if not path.is_symlink())
+        yield from (path for path in paths if path.is_file() and not path.is_symlink())
