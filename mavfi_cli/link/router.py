@@ -76,6 +76,7 @@ class Router:
         self.signing = signing
         self._passes = passes or (lambda message, _side: (frame_of(message),))
         self.peers: Peers[_Program] = Peers(signing=signing, allow_unsigned=allow_unsigned)
+        self._senders: dict[tuple[int, int], _Program] = {}  # newest, by system and component
         make = partial(_Program, router=self)
         self.peers.open(autopilot, partial(make, side=Side.AUTOPILOT))
         listener = self.peers.open(companion, partial(make, side=Side.COMPANION))
@@ -100,8 +101,14 @@ class Router:
 
     def receive(self, message: Message, sender: _Program) -> None:
         """Forward the frames that `passes` returns for a received message."""
+        self._senders[message.get_srcSystem(), message.get_srcComponent()] = sender
         for frame in self._passes(message, sender.side):
             self.send(frame, sender.side, sender)
+
+    def send_late(self, frame: bytes, side: Side, message: Message) -> None:
+        """Send a frame in place of a message that was held back, except to the message's sender."""
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        self.send(frame, side, self._senders.get(sender))
 
     def send(self, frame: bytes, side: Side, sender: Any = None) -> None:
         """Send a frame to every peer that gets the frames of `side`, except to `sender`."""

@@ -258,7 +258,7 @@ class CompanionFlight:
         if self.injection.link is not None:
             for message, side in self.injection.link.release(self.stamp_s):
                 for frame in self._deliver(message, side):
-                    self._router.send(frame, side)
+                    self._router.send_late(frame, side, message)
         for text in self.injection.news():
             self.logger.note(self.stamp_s, "fault", text, self.telemetry.state)
 

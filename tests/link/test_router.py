@@ -78,6 +78,20 @@ def test_programs_of_a_companion_hear_each_other_but_not_themselves(scene):
     assert one.receive(0.0) == b""
 
 
+def test_a_message_that_was_held_back_does_not_return_to_its_sender(scene):
+    held = []
+    router, autopilot, (one, other) = scene(
+        programs=2, passes=lambda message, _: held.append(message) or ()
+    )
+    for program, codec in ((one, PROGRAM), (other, Codec(246, 190))):
+        program.send(codec.encode(HEARTBEAT))
+        run(router, 2)
+    late = held[0]
+    router.send_late(frame_of(late), Side.COMPANION, late)
+    assert other.receive(1.0) == autopilot.receive(1.0) == frame_of(late)
+    assert one.receive(0.0) == b""
+
+
 def test_the_owner_decides_what_goes_on(scene):
     seen = []
 
