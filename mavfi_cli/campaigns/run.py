@@ -46,7 +46,7 @@ from mavfi_cli.campaigns.workers import (
 from mavfi_cli.core.errors import ConfigError, Interrupted
 from mavfi_cli.core.files import file_digest, own_folder, sync_folder, writing
 from mavfi_cli.core.installed import installed_versions, version_differences
-from mavfi_cli.core.processes import interruptible, may_leave_network
+from mavfi_cli.core.processes import fork, interruptible, leave_network
 from mavfi_cli.mission.instruction import CACHE, kept_in
 from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.mission.run_folder import RESULT
@@ -388,6 +388,12 @@ class MissionQueue:
         return (share.high - share.low) / 2.0 <= stop.margin
 
 
+def _may_leave_network() -> bool:
+    """Return True if the operating system allows this process's forks to call `leave_network`."""
+    _, status = os.waitpid(fork(lambda: 0 if leave_network() else 1), 0)
+    return status == 0
+
+
 class _Run:
     def __init__(
         self,
@@ -507,7 +513,7 @@ class _Run:
         if not self._checks_network or config.companion is None:
             return
         self._checks_network = False
-        if CompanionConfig.load(config.companion).own_network and not may_leave_network():
+        if CompanionConfig.load(config.companion).own_network and not _may_leave_network():
             self._spectator.on_note(
                 "no network namespaces are allowed here, so missions share the machine's ports: "
                 "a companion with a fixed port needs --jobs 1"

@@ -156,12 +156,6 @@ def interruptible() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def may_leave_network() -> bool:
-    """Return True if the operating system allows this process's forks to call `leave_network`."""
-    _, status = os.waitpid(fork(lambda: 0 if leave_network() else 1), 0)
-    return status == 0
-
-
 def leave_network() -> bool:
     """Move this process to a network namespace of its own, which has only a loopback interface.
 

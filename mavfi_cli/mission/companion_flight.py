@@ -39,7 +39,7 @@ from mavfi_cli.mission.programs import Programs
 from mavfi_cli.mission.progress import FlightLogger, FlightProgress, Watcher
 from mavfi_cli.mission.run_folder import RunFolder, Trace, load_run
 from mavfi_cli.mission.setpoint_gate import SetpointGate
-from mavfi_cli.mission.setpoints import SETPOINTS, Commanders, command_of
+from mavfi_cli.mission.setpoints import SETPOINTS, SetpointView, command_of
 from mavfi_cli.mission.success import SuccessVerdict
 from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
@@ -92,7 +92,7 @@ class CompanionFlight:
         self._heard_s = time.monotonic()
         self._command: Command | None = None
         self._gate = self._planned_gate()
-        self._commanders = Commanders()
+        self._commanders = SetpointView.Commanders()
         self._ticks = 0  # since the first arming
         self._mode, self._failsafe = "", False
         self._failsafe_in_air = False  # in command when the vehicle was last in the air

@@ -20,7 +20,7 @@ from mavfi_cli.core.types import Command, StackMark, Stage, Trajectory
 from mavfi_cli.detect.gate import Alarm, Gate
 from mavfi_cli.link.codec import Codec, Message, Signing, dialect, frame_of, renewed, text_messages
 from mavfi_cli.link.router import Side
-from mavfi_cli.mission.setpoints import SETPOINTS, Commanders, SetpointView
+from mavfi_cli.mission.setpoints import SETPOINTS, SetpointView
 from mavfi_cli.spec.companion import GateConfig
 from mavfi_cli.spec.detector import DetectorConfig
 
@@ -88,7 +88,7 @@ class SetpointGate:
         self._heartbeats: dict[tuple[int, int], float] = {}  # newest, by system and component
         # Newest setpoint and the time since which it is the same, by sender and message id.
         self._steady: dict[tuple[int, int, int], tuple[tuple[str, ...], float]] = {}
-        self._commanders = Commanders()
+        self._commanders = SetpointView.Commanders()
         self._failed = False
         self.outbox: list[bytes] = []
 

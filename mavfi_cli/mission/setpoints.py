@@ -43,27 +43,26 @@ _DEGREE_M = 1e-7 * 111_319.5  # one unit of lat_int
 _MOST_COMMANDERS = 100
 
 
-class Commanders:
-    """The senders of setpoints on a link, of which a vehicle should have only one."""
-
-    def __init__(self) -> None:
-        self._senders: set[tuple[int, int]] = set()
-
-    def another(self, setpoint: Message) -> str:
-        """Return a text if a setpoint comes from a further sender, otherwise an empty string.
-
-        At most 100 senders are known, so a flood of senders does not cause a flood of texts.
-        """
-        sender = setpoint.get_srcSystem(), setpoint.get_srcComponent()
-        if sender in self._senders or len(self._senders) >= _MOST_COMMANDERS:
-            return ""
-        self._senders.add(sender)
-        text = f"another commander, {sender[0]}/{sender[1]}, sends setpoints"
-        return text if len(self._senders) > 1 else ""
-
-
 class SetpointView:
     """Converts setpoints to samples, relative to the autopilot's newest state."""
+
+    class Commanders:
+        """The senders of setpoints on a link, of which a vehicle should have only one."""
+
+        def __init__(self) -> None:
+            self._senders: set[tuple[int, int]] = set()
+
+        def another(self, setpoint: Message) -> str:
+            """Return a text if a setpoint comes from a further sender, otherwise an empty string.
+
+            At most 100 senders are known, so a flood of senders does not cause a flood of texts.
+            """
+            sender = setpoint.get_srcSystem(), setpoint.get_srcComponent()
+            if sender in self._senders or len(self._senders) >= _MOST_COMMANDERS:
+                return ""
+            self._senders.add(sender)
+            text = f"another commander, {sender[0]}/{sender[1]}, sends setpoints"
+            return text if len(self._senders) > 1 else ""
 
     def __init__(self) -> None:
         self.telemetry = Telemetry()

@@ -19,7 +19,7 @@ from sitl.autopilot.commander import (
     Snapshot,
     no_setpoint,
 )
-from sitl.autopilot.flight_modes import begin, climbs, touches_down
+from sitl.autopilot.flight_modes import begin, climbs
 from sitl.autopilot.parameters import TYPE_REAL32, Parameters
 from sitl.autopilot.telemetry import Link, Links
 from sitl.geodesy import Origin
@@ -138,7 +138,7 @@ class Autopilot(Links):
         if self.commander.mode is not FlightMode.OFFBOARD:
             return True
         now = self.snapshot
-        return touches_down(now.setpoint[:6].tolist(), now.truth.position_ned_m.tolist())
+        return now.touches_down(now.setpoint[:6].tolist(), now.truth.position_ned_m.tolist())
 
     def fly(self) -> None:
         """Run the active mode: set the setpoint and the motors until the next stamp."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import math
 import operator
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
@@ -336,6 +337,10 @@ def no_setpoint() -> Setpoint:
     return _UNSET.copy()
 
 
+_STRAIGHT_DOWN_MPS = 0.3
+_STRAIGHT_DOWN_M = 0.5  # a place below the vehicle that is no farther away horizontally
+
+
 @dataclass(slots=True, kw_only=True)
 class Snapshot:
     """State of the flight, for guidance and telemetry. The autopilot updates it at every tick."""
@@ -354,6 +359,20 @@ class Snapshot:
     hold: tuple[Vector, float] | None = None  # NED position (3,) and yaw of the next LOITER
     elapsed_s: float = 0.0  # since the previous tick
     consumed_mah: float = 0.0
+
+    @staticmethod
+    def touches_down(setpoint: Sequence[float], place: Sequence[float]) -> bool:
+        """Return True if a setpoint leads straight down, so that it may end on the ground.
+
+        Args:
+            setpoint: Position (3,) and velocity (3,), NED, m and m/s; NaN if not requested.
+            place: Position (3,) of the vehicle, NED, m.
+        """
+        north, east, down = setpoint[3:6]
+        if math.hypot(north, east) < _STRAIGHT_DOWN_MPS and down > 0.0:
+            return True
+        north, east, down = (there - here for there, here in zip(setpoint[:3], place, strict=True))
+        return math.hypot(north, east) < _STRAIGHT_DOWN_M and down > 0.0
 
     @property
     def spooled_up(self) -> bool:

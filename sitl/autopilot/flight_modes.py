@@ -7,7 +7,7 @@ descend) are those of PX4's multicopter modes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -30,8 +30,6 @@ _TAKEOFF_NEAR_M = 0.2
 _ARRIVED_M = 0.5
 _STICK_INVALID = 32767
 _LIFTING = 0.1  # a setpoint with a larger thrust wants to leave the ground
-_STRAIGHT_DOWN_MPS = 0.3
-_STRAIGHT_DOWN_M = 0.5  # a place below the vehicle that is no farther away horizontally
 
 
 # Guidance of a flight mode, from entering the mode to leaving it. At every tick it writes its
@@ -46,20 +44,6 @@ def climbs(out: Setpoint, truth: Truth) -> bool:
     """
     lift = out[2] - truth.position_ned_m[2]
     return bool(out[5] < -_CLIMB_MPS or lift < -_CLIMB_M or out[SP_THRUST] > _LIFTING)
-
-
-def touches_down(setpoint: Sequence[float], place: Sequence[float]) -> bool:
-    """Return True if a setpoint leads straight down, so that it may end on the ground.
-
-    Args:
-        setpoint: Position (3,) and velocity (3,), NED, m and m/s; NaN where nothing is requested.
-        place: Position (3,) of the vehicle, NED, m.
-    """
-    north, east, down = setpoint[3:6]
-    if math.hypot(north, east) < _STRAIGHT_DOWN_MPS and down > 0.0:
-        return True
-    north, east, down = (there - here for there, here in zip(setpoint[:3], place, strict=True))
-    return math.hypot(north, east) < _STRAIGHT_DOWN_M and down > 0.0
 
 
 def _approach(delta: Vector, *, speed_mps: float, acceleration_mps2: float) -> Vector:

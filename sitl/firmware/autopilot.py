@@ -28,7 +28,7 @@ from mavfi_cli.link.codec import (
     text_messages,
 )
 from mavfi_cli.link.transport import Transport
-from sitl.autopilot.flight_modes import touches_down
+from sitl.autopilot.commander import Snapshot
 from sitl.autopilot.telemetry import Link, Links
 from sitl.camera.component import COMPONENT_ID as CAMERA
 from sitl.geodesy import Origin
@@ -63,7 +63,7 @@ class TouchdownWatch:
     @property
     def may_touch_ground(self) -> bool:
         """True if a gentle ground contact now counts as a landing."""
-        return not self._follows or touches_down(self._setpoint, self._place[:3])
+        return not self._follows or Snapshot.touches_down(self._setpoint, self._place[:3])
 
     def take(self, message: Any) -> None:
         """Take mode, position and setpoint from a message of the autopilot."""

@@ -18,7 +18,6 @@ from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ConfigError, MavfiError, RecordError
 from mavfi_cli.core.flight_record import ProgramEnds
-from mavfi_cli.core.processes import may_leave_network
 from mavfi_cli.link.codec import Codec
 from mavfi_cli.mission.crew import Crew
 from mavfi_cli.mission.run import fly_again
@@ -318,7 +317,7 @@ class Notes(Spectator):
 
 @pytest.mark.slow
 def test_a_machine_without_network_namespaces_is_told_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "may_leave_network", lambda: False)
+    monkeypatch.setattr(runner, "_may_leave_network", lambda: False)
     monkeypatch.setattr(Notes, "texts", [])
     config = MissionConfig(companion="true", world="farm", speed=SPEED)
     missions = [PlannedMission(config=replace(config, seed=seed)) for seed in (1, 2)]
@@ -328,7 +327,7 @@ def test_a_machine_without_network_namespaces_is_told_once(tmp_path, monkeypatch
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not may_leave_network(), reason="no network namespaces here")
+@pytest.mark.skipif(not runner._may_leave_network(), reason="no network namespaces here")
 @pytest.mark.parametrize("own", [True, False])
 def test_missions_of_a_campaign_have_networks_of_their_own(tmp_path, own):
     companion, here = tmp_path / "looks.toml", os.readlink("/proc/self/ns/net")

@@ -13,8 +13,8 @@ from types import SimpleNamespace
 import pytest
 from live_processes import gone
 
+from mavfi_cli.core import processes
 from mavfi_cli.fi.injector import Moment
-from mavfi_cli.fi.tracer import tracee
 from mavfi_cli.mission.instruction import companion
 from mavfi_cli.mission.instruction.companion import ProcessInjection
 from mavfi_cli.spec.fault import InstructionConfig
@@ -83,7 +83,7 @@ def test_a_process_without_which_its_program_goes_on_is_dead(
     program, pid = leader
     reads = "reads" in program.args
     if how == "ended":
-        monkeypatch.setattr(tracee, "_GET_INFO", 0)  # before Linux 6.15
+        monkeypatch.setattr(processes, "_GET_INFO", 0)  # before Linux 6.15
     injection, _ = struck(monkeypatch, tmp_path, program.pid, "/sleep")
     os.kill(pid, number)
     assert gone(pid)
@@ -136,7 +136,7 @@ def test_the_status_of_a_programs_own_process_may_come_from_its_worker(
     monkeypatch, tmp_path, leader, code, how
 ):
     started, _ = leader
-    monkeypatch.setattr(tracee, "_GET_INFO", 0)  # before Linux 6.15
+    monkeypatch.setattr(processes, "_GET_INFO", 0)  # before Linux 6.15
     injection, program = struck(monkeypatch, tmp_path, started.pid, "")
     started.kill()
     started.wait()
