@@ -70,16 +70,16 @@ class TouchdownWatch:
         if isinstance(message, dialect.MAVLink_heartbeat_message):
             self._follows = message.custom_mode == _FOLLOWING.get(message.autopilot)
         elif isinstance(message, dialect.MAVLink_local_position_ned_message):
-            self._place = _placed(message)
+            self._place = _position_and_velocity(message)
         elif isinstance(message, dialect.MAVLink_position_target_local_ned_message):
             mask = message.type_mask
             self._setpoint = tuple(
                 math.nan if mask >> axis & 1 else value
-                for axis, value in enumerate(_placed(message))
+                for axis, value in enumerate(_position_and_velocity(message))
             )
 
 
-def _placed(message: Any) -> tuple[float, ...]:
+def _position_and_velocity(message: Any) -> tuple[float, ...]:
     """Return the position (3,) and the velocity (3,) of a message, m and m/s."""
     return message.x, message.y, message.z, message.vx, message.vy, message.vz
 

@@ -50,6 +50,16 @@ def injector(target, *, signing=None, **request):
     )  # fmt: skip
 
 
+def hop_file(folder, speed):
+    """A companion's file whose program hops at a multiple of real time."""
+    path = folder / "hop.toml"
+    path.write_text(
+        f"[program.hop]\ncommand = '{sys.executable} -u {HOP} {{link}} {speed} lands'\n"
+        "[success]\nlanded = true\n"
+    )
+    return path
+
+
 def at(stamp_s):
     return Moment(stamp_s=stamp_s, flight_s=stamp_s, tick=0, phase="OFFBOARD")
 
@@ -241,11 +251,7 @@ def test_a_stopped_program_does_not_run_and_goes_on(tmp_path, share):
     ],
 )
 def test_a_struck_flight_has_a_record_of_its_fault(tmp_path, fault, outcome, line):
-    companion = tmp_path / "hop.toml"
-    companion.write_text(
-        f"[program.hop]\ncommand = '{sys.executable} {HOP} {{link}} 2 lands'\n"
-        "[success]\nlanded = true\n"
-    )
+    companion = hop_file(tmp_path, 2)
     run = library.fly(
         companion=str(companion), world="farm", speed=2.0, time_limit_s=60.0, out=tmp_path,
         fault=FaultConfig(**fault, at="time=7"),
@@ -259,11 +265,7 @@ def test_a_struck_flight_has_a_record_of_its_fault(tmp_path, fault, outcome, lin
 @pytest.mark.slow
 @pytest.mark.parametrize("process", ["hop", "hop/hop.py"])
 def test_an_instruction_of_a_program_is_struck_in_flight_and_struck_again(tmp_path, mavfi, process):
-    companion = tmp_path / "hop.toml"
-    companion.write_text(
-        f"[program.hop]\ncommand = '{sys.executable} -u {HOP} {{link}} 2 lands'\n"
-        "[success]\nlanded = true\n"
-    )
+    companion = hop_file(tmp_path, 2)
     line = ["fly", "--companion", companion, "--world", "farm", "--speed", 2, "--time-limit", 60]
     line += ["--no-picture", "--quiet", "--json", "--out", tmp_path]
     drawn = ["--level", "instruction", "--inject", process, "--at", "time=4"]
@@ -288,11 +290,7 @@ def test_without_permission_to_trace_a_flight_tells_the_remedy(tmp_path, monkeyp
         raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
 
     monkeypatch.setattr(linux, "request", refused)
-    companion = tmp_path / "hop.toml"
-    companion.write_text(
-        f"[program.hop]\ncommand = '{sys.executable} -u {HOP} {{link}} 4 lands'\n"
-        "[success]\nlanded = true\n"
-    )
+    companion = hop_file(tmp_path, 4)
     run = library.fly(
         companion=str(companion), world="farm", speed=4.0, time_limit_s=60.0, out=tmp_path,
         instruction=InstructionConfig(target="hop", at="time=4"),
