@@ -1,11 +1,14 @@
 r"""Counts the flights of a user's companion that faults lose, with and without the gate.
 
     python benchmarks/companion_gate.py docs/results/mavsdk-gate.parquet
+    python benchmarks/companion_gate.py docs/results/mavsdk-messages.parquet \
+        --by label_persistence label_site
 
-Reads exports of campaigns (`mavfi campaign export`) with golden flights, null faults and faults in
-instructions. A fault struck if the record has its activation. It is dead if its process ended, and
-silent if it was read and its process did not end. A flight is lost if it does not end in success.
-Intervals are Wilson's, 95 %; p is that of Fisher's exact test.
+Reads exports of campaigns (`mavfi campaign export`) with golden flights, null faults, and faults in
+instructions or messages. A fault struck if the record has its activation. It is dead if its process
+ended, and silent if it was read and its process did not end. A flight is lost if it does not end in
+success. Intervals are Wilson's, 95 %; p is that of Fisher's exact test. --by adds the lost flights
+by one column, or by several together, with p corrected by Holm for the rows.
 
 Flights before 30 November 2026 do not record the end of a process that a program has started, such
 as `mavsdk_server`, if the program fails at the same time. Such a fault therefore counts as dead if
@@ -15,14 +18,18 @@ whose output is kept.
 
 from __future__ import annotations
 
-from exported import Row, arguments, flown, lost, share
+from exported import Row, arguments, flown, key, lost, share
 
+from mavfi_cli.stats.paired import holm
 from mavfi_cli.stats.shares import wilson
 
 
 def main() -> None:
     """Read the exports, and print the fault-free flights and the faults, each as a table."""
-    rows = flown(arguments(__doc__).parse_args().parts)
+    parser = arguments(__doc__)
+    parser.add_argument("--by", nargs="+", default=[], metavar="COLUMN", help="columns of a group")
+    options = parser.parse_args()
+    rows = flown(options.parts)
     null = [row for row in rows if row.get("label_null")]
     golden = [row for row in rows if row["injected"] == "golden"]
     plain, gated = ([row for row in golden if bool(row["detector"]) is on] for on in (False, True))
@@ -31,7 +38,7 @@ def main() -> None:
         alarms = _alarms(part) if part is gated else ""
         print(f"| {name} | {share(len(part) - sum(map(lost, part)), len(part))} | {alarms} |")
 
-    drawn = [row for row in rows if row["level"] == "instruction" and not row.get("label_null")]
+    drawn = [row for row in rows if row["injected"] != "golden" and not row.get("label_null")]
     sides = [[row for row in drawn if bool(row["detector"]) is on] for on in (False, True)]
     struck = [[row for row in side if row["activation"]] for side in sides]
     print("\n| | without the gate | with the gate | p (Fisher) |\n|---|---|---|---|")
@@ -46,6 +53,22 @@ def main() -> None:
     alarmed = [row for row in struck[1] if row["alarm_count"]]
     print(f"\nAlarms in {len(alarmed)} of {len(struck[1])} struck flights with the gate, ", end="")
     print(f"of which {sum(map(lost, alarmed))} were lost.")
+    if options.by:
+        _by(tuple(options.by), struck)
+
+
+def _by(names: tuple[str, ...], struck: list[list[Row]]) -> None:
+    """Print the lost flights of both sides for each value of the columns, with corrected tests."""
+    print(f"\n| lost, by {', '.join(names)} | without the gate | with the gate | p (Holm) |")
+    print("|---|---|---|---|")
+    places = sorted({key(row, names) for side in struck for row in side}, key=repr)
+    groups = [
+        [[lost(row) for row in side if key(row, names) == place] for side in struck]
+        for place in places
+    ]
+    for place, sides, p_value in zip(places, groups, holm([*map(_fisher, groups)]), strict=True):
+        cells = " | ".join(share(sum(side), len(side)) for side in sides)
+        print(f"| {', '.join(map(str, place))} | {cells} | {p_value:.2g} |")
 
 
 def _dead(row: Row) -> bool:
@@ -69,10 +92,13 @@ def _compare(name: str, sides: list[list[bool]], *, counts: bool = False) -> Non
     if counts:
         print(f"| {name} | {hits[0]} | {hits[1]} | |")
         return
-    pairs = [*zip(hits, totals, strict=True)]
-    cells = " | ".join(share(*pair) for pair in pairs)
-    without, gated = (wilson(*pair) for pair in pairs)
-    print(f"| {name} | {cells} | {without.fisher(gated):.2g} |")
+    cells = " | ".join(share(*pair) for pair in zip(hits, totals, strict=True))
+    print(f"| {name} | {cells} | {_fisher(sides):.2g} |")
+
+
+def _fisher(sides: list[list[bool]]) -> float:
+    without, gated = (wilson(sum(side), len(side)) for side in sides)
+    return without.fisher(gated)
 
 
 if __name__ == "__main__":

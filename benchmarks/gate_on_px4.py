@@ -2,8 +2,8 @@ r"""Flies a MAVSDK script through `mavfi gate` to PX4, kills the gate, and print
 
     PX4_SITL=/opt/px4/bin/px4 python benchmarks/gate_on_px4.py gate/gad.json --fail closed
 
-Needs MAVSDK-Python. The script is `tests/clients/mavsdk_offboard.py`. The gate, or with `--both`
-the gate and its supervisor, gets SIGKILL 3 s after OFFBOARD begins.
+Needs MAVSDK-Python. The script is `tests/clients/mavsdk_offboard.py`. 3 s after OFFBOARD begins,
+the worker of the gate gets SIGKILL, and with `--both` its parent, too.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("model", help="model of the gate's detector")
     parser.add_argument("--fail", choices=("open", "closed"), default="open")
-    parser.add_argument("--both", action="store_true", help="kill the gate's supervisor, too")
+    parser.add_argument("--both", action="store_true", help="kill the gate's parent, too")
     given = parser.parse_args()
     vehicle = ["sitl", "--hil", "px4", "--firmware", os.environ["PX4_SITL"], "--world", "farm"]
     gate = ["gate", "--autopilot", PX4, "--to", f"udpin:{COMPANION}", "--detector", "gad"]

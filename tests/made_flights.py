@@ -6,6 +6,7 @@ evaluation has besides.
 
 import json
 
+import numpy as np
 import pyarrow as pa
 import pytest
 
@@ -21,6 +22,11 @@ from mavfi_cli.campaigns.missions import (
     canonical,
     changes_of,
 )
+from mavfi_cli.core.types import Command
+from mavfi_cli.detect.fit import fit
+from mavfi_cli.detect.offline import Dataset, FlightSamples
+from mavfi_cli.detect.preprocess import PreprocessParams
+from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
@@ -266,6 +272,30 @@ def watched(detector, gate_s, alarms=(), **detection):
         "host": {"stage_wall_s": {"gate": gate_s, "octomap": 0.15, "planner": 0.05, "link": 9.0}},
         "kernels": KERNELS,
     }  # fmt: skip
+
+
+def companion_gate(companion, threshold):
+    """A range detector for a companion's file, which knows speeds up to 3 m/s.
+
+    Its ten flights have random velocities, of which every second is zero.
+    """
+
+    def flown(seed):
+        rng = np.random.default_rng(seed)
+
+        def command(number):
+            velocity = rng.uniform(-3.0, 3.0, 3) * (number % 2)
+            return Command(stamp_s=0.0, velocity_enu_mps=velocity, yaw_rad=0.0)
+
+        ticks = ((0.1 * number, None, command(number)) for number in range(60))
+        return FlightSamples.of_ticks(ticks, "farm", seed)
+
+    samples = tuple(map(flown, range(10)))
+    mark = CompanionConfig.load(str(companion)).mark
+    model = fit("range", Dataset(flights=samples, preprocess=PreprocessParams(), stack=mark))
+    path = companion.with_name("range.json")
+    model.save(path)
+    return DetectorConfig(name="range", model=str(path), threshold=threshold)
 
 
 class Book:

@@ -1,7 +1,8 @@
-"""The numeric fields of MAVLink messages as states that a fault can strike.
+"""The fields of MAVLink messages as states that a fault can strike.
 
-A state is named MESSAGE.FIELD, or MESSAGE.FIELD[INDEX] for an element of an array. The elements of
-an array form a group, and so do fields whose names differ only in a final x, y or z.
+A state is named MESSAGE.FIELD, or MESSAGE.FIELD[INDEX] for an element of an array or a character of
+a text, which counts as a byte. The elements of an array form a group, and so do fields whose names
+differ only in a final x, y or z.
 """
 
 from __future__ import annotations
@@ -15,7 +16,10 @@ from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import DType, Scalar, State
 from mavfi_cli.link.codec import ADDED, Message, dialect
 
-_TYPES = {"float": DType.FLOAT32, "double": DType.FLOAT64, "uint8_t_mavlink_version": DType.UINT8}
+_TYPES = {
+    "float": DType.FLOAT32, "double": DType.FLOAT64, "char": DType.UINT8,
+    "uint8_t_mavlink_version": DType.UINT8,
+}  # fmt: skip
 _SETPOINTS = ("SET_POSITION_TARGET_LOCAL_NED", "SET_POSITION_TARGET_GLOBAL_INT")
 # Bits of their type_mask that make the autopilot ignore a field; see POSITION_TARGET_TYPEMASK.
 _IGNORED = {
@@ -25,14 +29,14 @@ _IGNORED = {
 
 
 class _WireState(State):
-    """A numeric field of a MAVLink message, or one element of an array field."""
+    """A number of a MAVLink message, an element of an array, or a byte of a text."""
 
     __slots__ = ()
 
     def read(self, message: Message, index: int) -> Scalar:
         """Return the field's value in a received message. `index` is ignored."""
-        value: Any = getattr(message, self.source)
-        number: Scalar = value if self.column is None else value[self.column]
+        content = self._content(message)
+        number: Scalar = content if self.column is None else content[self.column]
         return number
 
     def write(self, message: Message, index: int, value: Scalar) -> Message:
@@ -40,16 +44,25 @@ class _WireState(State):
 
         The copy still has the old frame. `index` is ignored.
         """
-        changed, field = copy.copy(message), getattr(message, self.source)
-        if self.column is not None:
-            field = [*field[: self.column], value, *field[self.column + 1 :]]
-        setattr(changed, self.source, value if self.column is None else field)
+        changed, content = copy.copy(message), self._content(message)
+        if self.column is None:
+            content = value
+        else:
+            content = type(content)([*content[: self.column], value, *content[self.column + 1 :]])
+        setattr(changed, self.source, content)
         return changed
+
+    def _content(self, message: Message) -> Any:
+        """Return the field. A text reaches at least to this byte, because the codec cuts zeros."""
+        content: Any = getattr(message, self.source)
+        if self.column is not None and isinstance(content, bytes):
+            return content.ljust(self.column + 1, b"\0")
+        return content
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WireFields:
-    """The numeric fields of one MAVLink message type, as states keyed by name."""
+    """The fields of one MAVLink message type, as states keyed by name."""
 
     name: str
     number: int  # message id
@@ -57,7 +70,7 @@ class WireFields:
 
     @classmethod
     def of(cls, name: str) -> WireFields:
-        """Return the numeric fields of the message type `name`.
+        """Return the fields of the message type `name`.
 
         Raises:
             UnknownName: The dialect has no such message. The message suggests the nearest.
@@ -69,20 +82,20 @@ class WireFields:
         kind: Any = kinds[name]
         states: dict[str, State] = {}
         of_fields = zip(kind.fieldnames, kind.fieldtypes, strict=True)
-        counts = dict(zip(kind.ordered_fieldnames, kind.lengths, strict=True))
+        lengths = zip(kind.lengths, kind.array_lengths, strict=True)  # only one knows of texts
+        counts = dict(zip(kind.ordered_fieldnames, map(max, lengths), strict=True))
         for field, wire in of_fields:
-            if wire == "char":  # a text has no value
-                continue
             unit = getattr(kind, "fieldunits_by_name", {}).get(field, "1")
             dtype = _TYPES.get(wire) or DType(wire.removesuffix("_t"))
             triple = {f"{field[:-1]}{axis}" for axis in "xyz"}
             together = field in triple and len(triple & {*kind.fieldnames}) > 1
             shared = f"{field[:-1]}*" if together else field
             count = counts[field]
+            source = f"_{field}_raw" if wire == "char" else field
             for column in [None] if count == 1 else range(count):
                 full = f"{name}.{field}" + ("" if column is None else f"[{column}]")
                 states[full] = _WireState(
-                    full, kind, field, unit, column=column, dtype=dtype, group=f"{name}.{shared}"
+                    full, kind, source, unit, column=column, dtype=dtype, group=f"{name}.{shared}"
                 )
         return cls(name=name, number=kind.id, states=states)
 

@@ -318,7 +318,8 @@ class CompanionFlight:
             self._crew.hear(message.get_srcSystem(), message.get_srcComponent())
         if message.get_msgId() not in SETPOINTS:
             return
-        if text := self._commanders.another(message):
+        # A gate tells it itself.
+        if self._gate is None and (text := self._commanders.another(message)):
             self.logger.note(self.stamp_s, "program", text, self.telemetry.state)
         if message.get_msgId() == _SETPOINT and self.telemetry.state is not None:
             self._command = command_of(message, self.telemetry.state)

@@ -1,7 +1,7 @@
 """`mavfi gate`: the gate as a process between a companion and an autopilot.
 
-A supervisor opens both links and forks a worker, which routes frames and judges setpoints. When
-the worker fails or dies, or shows no sign of life for 1 s, the supervisor forks another on the same
+A parent opens both links and forks a worker, which routes frames and judges setpoints. When
+the worker fails or dies, or shows no sign of life for 1 s, the parent forks another on the same
 links. That one judges nothing: it passes everything (fails open), or everything but setpoints
 (fails closed).
 """
@@ -117,13 +117,13 @@ class _Worker:
                 os.write(self._log, json.dumps(line).encode() + b"\n")
 
     def work(self, alive: int, *, judges: bool) -> int:
-        """Route frames until the supervisor ends this process. Return the exit code after an error.
+        """Route frames until the parent ends this process. Return the exit code after an error.
 
-        In every turn, write to the pipe `alive`, so that the supervisor sees a sign of life.
+        In every turn, write to the pipe `alive`, so that the parent sees a sign of life.
         """
         try:
             return exit_code(lambda: self._route(alive, judges=judges))
-        except Exception as error:  # the worker's boundary: the supervisor forks another
+        except Exception as error:  # the worker's boundary: the parent forks another
             with contextlib.suppress(OSError):
                 self.tell(f"the gate ends: {described(error)}")
             return _FAILED
@@ -171,7 +171,7 @@ def _supervise(worker: _Worker, interrupts: Sequence[int], *, judges: bool) -> i
     reading, writing = os.pipe()
 
     def work() -> int:
-        os.close(reading)  # a write fails once the supervisor is gone
+        os.close(reading)  # a write fails once the parent is gone
         return worker.work(writing, judges=judges)
 
     child = fork(work)

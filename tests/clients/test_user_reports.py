@@ -8,16 +8,10 @@ import os
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
+from made_flights import companion_gate
 
 from mavfi_cli import library
-from mavfi_cli.core.types import Command
-from mavfi_cli.detect.fit import fit
-from mavfi_cli.detect.offline import Dataset, FlightSamples
-from mavfi_cli.detect.preprocess import PreprocessParams
-from mavfi_cli.spec.companion import CompanionConfig
-from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import InstructionConfig
 
 SCRIPT = Path(__file__).with_name("mavsdk_offboard.py")
@@ -30,40 +24,21 @@ def fly(request, tmp_path):
         pytest.skip("PX4_SITL names no PX4")
     path = tmp_path / "script.toml"
 
-    def flown(fault, *, threshold=None, time_limit_s=25.0, instruction=None):
+    def flown(fault, *, threshold=None, time_limit_s=25.0, instruction=None, action="hold"):
         path.write_text(
             f"[program.script]\ncommand = '{sys.executable} {SCRIPT} {{mavsdk}} {{free}}'\n"
             f"environment = {{ FAULT = '{fault}', WILD_S = '3' }}\n[success]\nlanded = true\n"
+            f"[gate]\naction = '{action}'\n"
         )
         detector = None
         if threshold is not None:
-            model = fit("range", flights_of(CompanionConfig.load(str(path)).mark))
-            model.save(tmp_path / "range.json")
-            detector = DetectorConfig(
-                name="range", model=str(tmp_path / "range.json"), threshold=threshold
-            )
+            detector = companion_gate(path, threshold)
         return library.fly(
             companion=str(path), world="farm", seed=1, time_limit_s=time_limit_s, out=tmp_path,
             autopilot=request.param, detector=detector, instruction=instruction,
         )  # fmt: skip
 
     return flown
-
-
-def flights_of(mark):
-    """Ten flights of a companion in which every second setpoint is zero."""
-
-    def flight(seed):
-        rng = np.random.default_rng(seed)
-
-        def command(number):
-            velocity = rng.uniform(-3.0, 3.0, 3) * (number % 2)
-            return Command(stamp_s=0.0, velocity_enu_mps=velocity, yaw_rad=0.0)
-
-        ticks = ((0.1 * number, None, command(number)) for number in range(60))
-        return FlightSamples.of_ticks(ticks, "farm", seed)
-
-    return Dataset(flights=tuple(map(flight, range(10))), preprocess=PreprocessParams(), stack=mark)
 
 
 @pytest.mark.slow
@@ -80,12 +55,28 @@ def test_the_server_of_a_dead_script_flies_on_until_the_gate_withholds_what_no_l
 
 
 @pytest.mark.slow
-def test_the_gate_withholds_a_wild_setpoint(fly):
+def test_a_wild_setpoint_is_flown_without_the_gate(fly):
     assert fastest_mps(fly("wild")) > 6.0
-    guarded = fly("wild", threshold=0.5, time_limit_s=60.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("action", ["hold", "brake"])
+def test_the_gate_withholds_a_wild_setpoint(fly, action):
+    guarded = fly("wild", threshold=0.5, time_limit_s=60.0, action=action)
     assert guarded.record.outcome == "success"
     assert fastest_mps(guarded) < 3.0
     assert guarded.record.detection.alarm_count >= 1
+    assert guarded.record.detection.responses[action] >= 1
+
+
+@pytest.mark.slow
+def test_the_autopilot_holds_and_the_script_waits(fly):
+    guarded = fly("wild", threshold=0.5, action="autopilot")
+    assert guarded.record.outcome == "timeout"  # the script does not switch back to OFFBOARD
+    assert fastest_mps(guarded) < 3.0
+    assert guarded.record.detection.responses["autopilot"] >= 1
+    texts = [event.text for event in guarded.record.events]
+    assert "AUTO.LOITER" in texts[texts.index("OFFBOARD") :]
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from live_processes import LONG_S, children
+from native_programs import native_program  # noqa: F401
 
 from mavfi_cli.mission.progress import Watcher
 

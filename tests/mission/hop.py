@@ -1,6 +1,7 @@
-"""A companion in few lines: climbs, flies north, lands. Arguments: link, speed and how it ends.
+"""A companion in few lines: climbs, flies north, lands.
 
-It takes its time from the autopilot, so that load on the machine does not change its path.
+Arguments: link, speed, how it ends, and its component id (191). It takes its time from
+the autopilot, so that load on the machine does not change its path.
 """
 
 import os
@@ -10,7 +11,8 @@ import time
 
 from pymavlink import mavutil
 
-link = mavutil.mavlink_connection(sys.argv[1], source_system=1, source_component=191)
+own = int(sys.argv[4]) if len(sys.argv) > 4 else 191
+link = mavutil.mavlink_connection(sys.argv[1], source_system=1, source_component=own)
 speed, end = float(sys.argv[2]), sys.argv[3]
 mav, common = link.mav, mavutil.mavlink
 VELOCITY = 0b1001_1100_0111  # ignores positions, accelerations and the yaw rate

@@ -4,10 +4,12 @@ import errno
 import json
 import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from live_processes import LONG_S
 
@@ -17,6 +19,7 @@ from mavfi_cli.core.errors import FaultSpecError, MavfiError, UnknownName
 from mavfi_cli.fi.injector import Moment
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.link.codec import Codec, Signing, dialect, frame_of, key_from_passphrase
+from mavfi_cli.link.fields import WireFields
 from mavfi_cli.link.router import Side
 from mavfi_cli.mission.companion_faults import (
     CompanionInjection,
@@ -75,6 +78,23 @@ def test_a_struck_frame_is_valid_and_differs_in_the_field_only():
     assert (before.vx, read.vx) == (2.0, 0.0)
     assert read.get_header().pack() == before.get_header().pack()
     assert {**read.to_dict(), "vx": 2.0} == before.to_dict()
+
+
+@pytest.mark.parametrize(("index", "bit", "text"), [(0, 1, b"OPE"), (3, 0, b"MPE\1")])
+def test_a_character_of_a_text_is_struck(index, bit, text):
+    message = dialect.MAVLink_param_request_read_message(1, 1, b"MPE", -1)
+    (before,) = Codec(0, 0).decode(Codec(1, 191).encode(message))
+    link = injector(f"PARAM_REQUEST_READ.param_id[{index}]", exact_bits=(bit,))
+    (after,) = passed(link, [before])
+    (read,) = Codec(0, 0).decode(frame_of(after))
+    assert (read._param_id_raw, read.param_index) == (text, -1)
+
+
+def test_every_field_of_every_message_can_be_struck():
+    for kind in dialect.mavlink_map.values():
+        states = WireFields.of(kind.msgname).states.values()
+        sizes = [np.dtype(state.dtype.value).itemsize for state in states]
+        assert sum(sizes) == kind.unpacker.size, kind.msgname
 
 
 def test_a_signed_frame_is_signed_again_and_stays_out_without_a_key():
@@ -282,6 +302,24 @@ def test_an_instruction_of_a_program_is_struck_in_flight_and_struck_again(tmp_pa
     first, again = ((fault["object"], fault["offset"], fault["corruption"]) for fault in faults)
     assert first == again
     assert not first[0].startswith(("python", "libpython"))
+
+
+@pytest.mark.slow
+def test_a_static_program_is_struck_in_flight(tmp_path, native_program):
+    try:
+        counting = native_program("counting", "-static")
+    except subprocess.CalledProcessError:
+        pytest.skip("no static libc")
+    companion = hop_file(tmp_path, 4)
+    more = f"[program.counting]\ncommand = '{counting} 1000000000000'\n"
+    companion.write_text(more + companion.read_text())
+    run = library.fly(
+        companion=str(companion), world="farm", speed=4.0, time_limit_s=60.0, out=tmp_path,
+        instruction=InstructionConfig(target="counting", at="time=4", seed=1),
+    )  # fmt: skip
+    fault = run.record.instruction_fault
+    assert (fault.state, fault.node, fault.object) == ("applied", "counting", counting.name)
+    assert fault.symbol.split("+")[0] in ("main", "body")
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from made_flights import companion_gate
 
 from mavfi_cli import library
 from mavfi_cli.campaigns import run as runner
@@ -35,12 +36,16 @@ SPEED = 4.0
 def fly(tmp_path):
     """A function that flies the hop in an empty scene; arguments are keys of the companion."""
 
-    def flown(end, *, success="landed = true", program="", top="", limit_s=60.0, **settings):
+    def flown(
+        end, *, success="landed = true", program="", top="", limit_s=60.0, gated=False, **settings
+    ):
         companion = tmp_path / "hop.toml"
         companion.write_text(
             f"{top}\n[program.hop]\ncommand = '{sys.executable} {HOP} {{link}} {SPEED} {end}'\n"
             f"{program}\n[success]\n{success}\n"
         )
+        if gated:
+            settings["detector"] = companion_gate(companion, 1e6)
         return library.fly(
             companion=str(companion), world="farm", speed=SPEED, time_limit_s=limit_s,
             out=tmp_path / "runs", **settings,
@@ -99,6 +104,15 @@ def test_every_end_is_a_result(fly, end, options, outcome, reason):
     record = fly(end, **options).record
     assert record.outcome == outcome
     assert reason in record.reason
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gated", [False, True])
+def test_another_commander_is_told_once(fly, gated):
+    second = f"[program.second]\ncommand = '{sys.executable} {HOP} {{link}} {SPEED} lands 190'\n"
+    run = fly("lands", program=second, gated=gated, limit_s=10.0)
+    texts = [event.text for event in run.record.events]
+    assert sum("sends setpoints" in text for text in texts) == 1
 
 
 @pytest.mark.slow
