@@ -72,14 +72,23 @@ class WireFields:
     def of(cls, name: str) -> WireFields:
         """Return the fields of the message type `name`.
 
+        If only ArduPilot has this message, every codec of the process decodes it from now on.
+
         Raises:
-            UnknownName: The dialect has no such message. The message suggests the nearest.
+            UnknownName: Neither the `common` dialect nor ArduPilot has such a message. The error
+                suggests the nearest.
         """
         kinds = {kind.msgname: kind for kind in (*dialect.mavlink_map.values(), *ADDED.values())}
+        if name not in kinds:
+            from pymavlink.dialects.v20 import ardupilotmega  # slow to load
+
+            kinds = {kind.msgname: kind for kind in ardupilotmega.mavlink_map.values()} | kinds
         if name not in kinds:
             near = difflib.get_close_matches(name, kinds, 6, 0.0)
             raise UnknownName("message", name, near)
         kind: Any = kinds[name]
+        if kind.id not in dialect.mavlink_map:
+            ADDED[kind.id] = kind
         states: dict[str, State] = {}
         of_fields = zip(kind.fieldnames, kind.fieldtypes, strict=True)
         lengths = zip(kind.lengths, kind.array_lengths, strict=True)  # only one knows of texts

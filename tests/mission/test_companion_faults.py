@@ -12,12 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from live_processes import LONG_S
+from pymavlink.dialects.v20 import ardupilotmega
 
 from mavfi_cli import library
 from mavfi_cli.cli.fly import _TOO_SHORT
 from mavfi_cli.core.errors import FaultSpecError, MavfiError, UnknownName
 from mavfi_cli.fi.injector import Moment
 from mavfi_cli.fi.tracer import linux
+from mavfi_cli.link import codec, fields
 from mavfi_cli.link.codec import Codec, Signing, dialect, frame_of, key_from_passphrase
 from mavfi_cli.link.fields import WireFields
 from mavfi_cli.link.router import Side
@@ -88,6 +90,18 @@ def test_a_character_of_a_text_is_struck(index, bit, text):
     (after,) = passed(link, [before])
     (read,) = Codec(0, 0).decode(frame_of(after))
     assert (read._param_id_raw, read.param_index) == (text, -1)
+
+
+def test_a_message_that_only_ardupilot_has_is_struck(monkeypatch):
+    monkeypatch.setattr(fields, "ADDED", codec.ADDED.copy())
+    monkeypatch.setattr(codec, "ADDED", fields.ADDED)
+    sender = ardupilotmega.MAVLink(None, srcSystem=1, srcComponent=1)
+    frame = ardupilotmega.MAVLink_rangefinder_message(2.0, 0.5).pack(sender)
+    link = injector("RANGEFINDER.distance", exact_bits=(30,))
+    (before,) = Codec(0, 0, keeps_unknown=True).decode(frame)
+    (after,) = passed(link, [before], Side.AUTOPILOT)
+    (read,) = ardupilotmega.MAVLink(None).parse_buffer(frame_of(after))
+    assert (read.distance, read.voltage, read.get_srcSystem()) == (0.0, 0.5, 1)
 
 
 def test_every_field_of_every_message_can_be_struck():
