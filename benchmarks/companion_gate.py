@@ -8,7 +8,8 @@ Reads exports of campaigns (`mavfi campaign export`) with golden flights, null f
 instructions or messages. A fault struck if the record has its activation. It is dead if its process
 ended, and silent if it was read and its process did not end. A flight is lost if it does not end in
 success. Intervals are Wilson's, 95 %; p is that of Fisher's exact test. --by adds the lost flights
-by one column, or by several together, with p corrected by Holm for the rows.
+by one column, or by several together, with p corrected by Holm for the rows. With --whole, a flight
+that covers less than three quarters of the median golden distance is lost, too.
 
 Flights before 30 November 2026 do not record the end of a process that a program has started, such
 as `mavsdk_server`, if the program fails at the same time. Such a fault therefore counts as dead if
@@ -18,7 +19,10 @@ whose output is kept.
 
 from __future__ import annotations
 
-from exported import Row, arguments, flown, key, lost, share
+from collections.abc import Iterator, Sequence
+from statistics import median
+
+from exported import Row, arguments, cells, flown, lost, share
 
 from mavfi_cli.stats.paired import holm
 from mavfi_cli.stats.shares import wilson
@@ -26,10 +30,12 @@ from mavfi_cli.stats.shares import wilson
 
 def main() -> None:
     """Read the exports, and print the fault-free flights and the faults, each as a table."""
-    parser = arguments(__doc__)
-    parser.add_argument("--by", nargs="+", default=[], metavar="COLUMN", help="columns of a group")
+    parser = arguments(__doc__, by=[])
+    parser.add_argument("--whole", action="store_true", help="short flights are lost, too")
     options = parser.parse_args()
     rows = flown(options.parts)
+    if options.whole:
+        rows = [*_short_are_lost(rows)]
     null = [row for row in rows if row.get("label_null")]
     golden = [row for row in rows if row["injected"] == "golden"]
     plain, gated = ([row for row in golden if bool(row["detector"]) is on] for on in (False, True))
@@ -54,21 +60,26 @@ def main() -> None:
     print(f"\nAlarms in {len(alarmed)} of {len(struck[1])} struck flights with the gate, ", end="")
     print(f"of which {sum(map(lost, alarmed))} were lost.")
     if options.by:
-        _by(tuple(options.by), struck)
+        _by(options.by, struck)
 
 
-def _by(names: tuple[str, ...], struck: list[list[Row]]) -> None:
-    """Print the lost flights of both sides for each value of the columns, with corrected tests."""
-    print(f"\n| lost, by {', '.join(names)} | without the gate | with the gate | p (Holm) |")
-    print("|---|---|---|---|")
-    places = sorted({key(row, names) for side in struck for row in side}, key=repr)
-    groups = [
-        [[lost(row) for row in side if key(row, names) == place] for side in struck]
-        for place in places
-    ]
+def _short_are_lost(rows: list[Row]) -> Iterator[Row]:
+    whole_m = median(row["distance_m"] for row in rows if row["injected"] == "golden")
+    for row in rows:
+        short = (row["distance_m"] or 0.0) < 0.75 * whole_m
+        yield {**row, "outcome": "short"} if short and not lost(row) else row
+
+
+def _by(names: Sequence[str], struck: list[list[Row]]) -> None:
+    """Print the lost flights of both sides for each cell, with corrected tests."""
+    print(f"\n| {' | '.join(names)} | without the gate | with the gate | p (Holm) |")
+    print("|---" * (len(names) + 3) + "|")
+    without, gated = (cells(side, names) for side in struck)
+    places = sorted({*without, *gated})
+    groups = [[[*map(lost, side.get(place, ()))] for side in (without, gated)] for place in places]
     for place, sides, p_value in zip(places, groups, holm([*map(_fisher, groups)]), strict=True):
-        cells = " | ".join(share(sum(side), len(side)) for side in sides)
-        print(f"| {', '.join(map(str, place))} | {cells} | {p_value:.2g} |")
+        shares = " | ".join(share(sum(side), len(side)) for side in sides)
+        print(f"| {' | '.join(place)} | {shares} | {p_value:.2g} |")
 
 
 def _dead(row: Row) -> bool:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+import collections
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import pyarrow.parquet as pq
@@ -16,10 +17,17 @@ Key = tuple[Any, ...]
 PAIRED = ("world", "world_seed", "seed", "stack", "platform")  # of a mission and its golden flight
 
 
-def arguments(text: str | None) -> argparse.ArgumentParser:
-    """Return an argument parser that accepts exports of campaigns (`mavfi campaign export`)."""
+def arguments(text: str | None, by: Sequence[str] | None = None) -> argparse.ArgumentParser:
+    """Return an argument parser that accepts exports of campaigns (`mavfi campaign export`).
+
+    With `by`, the parser also has the option --by with this default, for `cells`.
+    """
     parser = argparse.ArgumentParser(description=text)
     parser.add_argument("parts", nargs="+", help="exports of campaigns, as Parquet")
+    if by is not None:
+        parser.add_argument(
+            "--by", nargs="+", default=[*by], metavar="COLUMN", help="columns that name a cell"
+        )
     return parser
 
 
@@ -32,6 +40,14 @@ def flown(parts: list[str]) -> list[Row]:
 def key(row: Row, names: tuple[str, ...]) -> Key:
     """Return the values of the named columns in a row."""
     return tuple(row[name] for name in names)
+
+
+def cells(rows: Iterable[Row], by: Sequence[str]) -> dict[tuple[str, ...], list[Row]]:
+    """Return the rows that have the same values in the named columns, keyed by these and sorted."""
+    found: dict[tuple[str, ...], list[Row]] = collections.defaultdict(list)
+    for row in rows:
+        found[tuple(str(row.get(name) or "") for name in by)].append(row)
+    return dict(sorted(found.items()))
 
 
 def lost(row: Row) -> bool:

@@ -12,22 +12,19 @@ world, world seed, seed, stack and platform. Intervals are Wilson's, 95 %.
 from __future__ import annotations
 
 import collections
-from collections.abc import Iterable
+from collections.abc import Sequence
 
-from exported import PAIRED, Row, arguments, flown, key, lost, share
+from exported import PAIRED, Row, arguments, cells, flown, key, lost, share
 
 from mavfi_cli.analysis.pairs import LONGER
 
 
-def lines(rows: list[Row], by: Iterable[str]) -> list[str]:
+def lines(rows: list[Row], by: Sequence[str]) -> list[str]:
     """Return a row of the table for each cell, which is a combination of values of the columns."""
     golden = {key(r, PAIRED): r["flight_time_s"] for r in rows if r["injected"] == "golden"}
-    cells: dict[tuple[str, ...], list[Row]] = collections.defaultdict(list)
-    for row in rows:
-        if row["injected"] == "golden" or row["activation"] == "read":
-            cells[tuple(str(row.get(name) or "") for name in by)].append(row)
+    counted = (r for r in rows if r["injected"] == "golden" or r["activation"] == "read")
     printed = []
-    for name, cell in sorted(cells.items()):
+    for name, cell in cells(counted, by).items():
         failed = [row for row in cell if lost(row)]
         paired = [row for row in cell if not lost(row) and key(row, PAIRED) in golden]
         longer = sum(row["flight_time_s"] > LONGER * golden[key(row, PAIRED)] for row in paired)
@@ -42,9 +39,7 @@ def lines(rows: list[Row], by: Iterable[str]) -> list[str]:
 
 def main() -> None:
     """Read the exports, and print the table."""
-    parser = arguments(__doc__)
-    parser.add_argument("--by", nargs="+", required=True, help="columns that name a cell")
-    given = parser.parse_args()
+    given = arguments(__doc__, by=["world"]).parse_args()
     print(f"| {' | '.join(given.by)} | lost | longer by > 10 % | ends |")
     print("|---" * (len(given.by) + 3) + "|")
     print("\n".join(lines(flown(given.parts), given.by)))

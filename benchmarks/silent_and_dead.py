@@ -12,25 +12,19 @@ Intervals are Wilson's, 95 %, and take the missions of each seed as a cluster.
 
 from __future__ import annotations
 
-import collections
-
-from exported import PAIRED, Row, arguments, flown, golden_lost, key, share_lost
+from exported import PAIRED, arguments, cells, flown, golden_lost, key, share_lost
 
 
 def main() -> None:
     """Read the exports, and print a row for each combination of values of the columns."""
-    parser = arguments(__doc__)
-    parser.add_argument("--by", nargs="+", required=True, help="columns that name a cell")
-    given = parser.parse_args()
+    given = arguments(__doc__, by=["world"]).parse_args()
     rows = flown(given.parts)
     golden = golden_lost(rows)
-    cells: dict[tuple[str, ...], list[Row]] = collections.defaultdict(list)
-    for row in rows:
-        if row["level"] == "instruction" and golden.get(key(row, PAIRED)) is False:
-            cells[tuple(str(row.get(name) or "") for name in given.by)].append(row)
+    struck = [row for row in rows if row["level"] == "instruction"]
+    counted = [row for row in struck if golden.get(key(row, PAIRED)) is False]
     print(f"| {' | '.join(given.by)} | all faults: lost | lost | lost, dead node | lost, silent |")
     print("|---" * (len(given.by) + 4) + "|")
-    for name, cell in sorted(cells.items()):
+    for name, cell in cells(counted, given.by).items():
         dead = [row for row in cell if row["node_ended"]]
         silent = [row for row in cell if row["activation"] == "read" and not row["node_ended"]]
         parts = (cell, dead + silent, dead, silent)

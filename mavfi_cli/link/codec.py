@@ -468,7 +468,10 @@ AvailableModes = _message_class(
 ADDED: dict[int, Any] = {
     message.id: message for message in (ProtocolVersion, ComponentMetadata, AvailableModes)
 }
-"""The message classes that this module adds to the dialect, keyed by message id."""
+"""The message classes besides those of the dialect, keyed by message id.
+
+`WireFields.of` adds those of ArduPilot that a fault strikes.
+"""
 
 SLOW_STREAMS_US = {
     dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 2e5,

@@ -42,7 +42,8 @@ class _WireState(State):
     def write(self, message: Message, index: int, value: Scalar) -> Message:
         """Return a copy of a received message in which this field has the given value.
 
-        The copy still has the old frame. `index` is ignored.
+        The copy still has the old frame, and of a text only the raw bytes differ. `index` is
+        ignored.
         """
         changed, content = copy.copy(message), self._content(message)
         if self.column is None:
@@ -91,17 +92,15 @@ class WireFields:
             ADDED[kind.id] = kind
         states: dict[str, State] = {}
         of_fields = zip(kind.fieldnames, kind.fieldtypes, strict=True)
-        lengths = zip(kind.lengths, kind.array_lengths, strict=True)  # only one knows of texts
-        counts = dict(zip(kind.ordered_fieldnames, map(max, lengths), strict=True))
+        counts = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
         for field, wire in of_fields:
             unit = getattr(kind, "fieldunits_by_name", {}).get(field, "1")
             dtype = _TYPES.get(wire) or DType(wire.removesuffix("_t"))
             triple = {f"{field[:-1]}{axis}" for axis in "xyz"}
             together = field in triple and len(triple & {*kind.fieldnames}) > 1
             shared = f"{field[:-1]}*" if together else field
-            count = counts[field]
             source = f"_{field}_raw" if wire == "char" else field
-            for column in [None] if count == 1 else range(count):
+            for column in range(counts[field]) or [None]:
                 full = f"{name}.{field}" + ("" if column is None else f"[{column}]")
                 states[full] = _WireState(
                     full, kind, source, unit, column=column, dtype=dtype, group=f"{name}.{shared}"

@@ -318,7 +318,7 @@ class CompanionFlight:
             self._crew.hear(message.get_srcSystem(), message.get_srcComponent())
         if message.get_msgId() not in SETPOINTS:
             return
-        # A gate tells it itself.
+        # The gate notes it, if there is one.
         if self._gate is None and (text := self._commanders.another(message)):
             self.logger.note(self.stamp_s, "program", text, self.telemetry.state)
         if message.get_msgId() == _SETPOINT and self.telemetry.state is not None:
@@ -342,9 +342,8 @@ class CompanionFlight:
         elif self._interrupts:
             self._end(Outcome.INTERRUPTED)
         elif self._verdict.is_over():
-            if self._verdict.strayed:
-                text = f"up to {self._verdict.deviation_m:.1f} m from the golden path"
-                self._end(Outcome.TIMEOUT, text)
+            if deviation := self._verdict.deviation():
+                self._end(Outcome.TIMEOUT, deviation)
             else:
                 self._end(Outcome.SUCCESS, self._verdict.describe())
         elif self._crew.unready:

@@ -81,7 +81,7 @@ class GateProcess:
         judges = True
         with interruptible() as interrupts:
             while True:
-                code = _supervise(worker, interrupts, judges=judges)
+                code = _watched(worker, interrupts, judges=judges)
                 if code is not None:
                     return code
                 if judges:
@@ -162,8 +162,8 @@ def _closed(message: Message, side: Side) -> Sequence[Message]:
     return () if side is Side.COMPANION and message.get_msgId() in SETPOINTS else (message,)
 
 
-def _supervise(worker: _Worker, interrupts: Sequence[int], *, judges: bool) -> int | None:
-    """Fork a worker and supervise it until it ends.
+def _watched(worker: _Worker, interrupts: Sequence[int], *, judges: bool) -> int | None:
+    """Fork a worker and watch it until it ends.
 
     Return its exit code, 0 if this process was interrupted, or None if the worker was killed, hung
     or failed.

@@ -54,6 +54,11 @@ class FlownPath:
         shares = np.clip(((place - begin) * along).sum(axis=1) / lengths, 0.0, 1.0)
         return float(np.sqrt(((begin + shares[:, None] * along - place) ** 2).sum(axis=1)).min())
 
+    def apart_m(self, other: FlownPath) -> float:
+        """Return the largest distance of a position of either path from the other path, metres."""
+        there, back = map(self.distance_m, other.places), map(other.distance_m, self.places)
+        return max(*there, *back)
+
 
 class SuccessVerdict:
     """Decides whether a flight has succeeded.
@@ -75,13 +80,18 @@ class SuccessVerdict:
         self.landed = self.flew = False
         self._rest_since_s = math.inf
         self._rests = False
-        self.deviation_m = 0.0  # largest distance from the golden path
         self._path = None if success.golden is None else FlownPath.of(Path(success.golden))
+        self._away_m = 0.0  # largest distance of the vehicle from the golden path
+        # Smallest distance of the vehicle from each position of the golden path.
+        self._missed_m = np.full(0 if self._path is None else len(self._path.places), np.inf)
 
     def see(self, state: VehicleState) -> None:
         """Update the verdict with a new state of the vehicle."""
         if self._path is not None:
-            self.deviation_m = max(self.deviation_m, self._path.distance_m(state.position_enu_m))
+            place = state.position_enu_m
+            self._away_m = max(self._away_m, self._path.distance_m(place))
+            steps_m = np.sqrt(((self._path.places - place) ** 2).sum(axis=1))
+            self._missed_m = np.fmin(self._missed_m, steps_m)
         near_m = self._success.goal_m
         assert self.goal_enu_m is not None
         if (
@@ -107,11 +117,17 @@ class SuccessVerdict:
         )
         return ", ".join(filter(None, parts))
 
-    @property
-    def strayed(self) -> bool:
-        """True if the vehicle has left the corridor."""
-        corridor_m = self._success.corridor_m
-        return corridor_m is not None and self.deviation_m > corridor_m
+    def deviation(self) -> str:
+        """Return how the whole flight left the corridor, or an empty string if it did not.
+
+        The vehicle leaves the corridor if it strays from the golden path, or misses a part of it.
+        """
+        corridor_m, missed_m = self._success.corridor_m, max(self._missed_m, default=0.0)
+        if corridor_m is not None and self._away_m > corridor_m:
+            return f"up to {self._away_m:.1f} m from the golden path"
+        if corridor_m is not None and missed_m > corridor_m:
+            return f"part of the golden path was missed by {missed_m:.1f} m"
+        return ""
 
     def is_over(self) -> bool:
         """Return True if all configured conditions of success hold, apart from the corridor.

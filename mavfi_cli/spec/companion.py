@@ -133,7 +133,8 @@ class SuccessConfig:
         landed: The vehicle stands on the ground, disarmed, after a flight that no failsafe of the
             autopilot has ended.
         exit: Name of a program that must have exited with code 0.
-        corridor_m: The vehicle was never farther than this from the path of `golden`, m.
+        corridor_m: The vehicle was never farther than this from the path of `golden`, m, and every
+            place of that path was within this distance of the vehicle once.
         golden: Run folder of the flight whose path `corridor_m` refers to, relative to the file of
             the companion.
     """

@@ -28,8 +28,8 @@ class Spread:
         outcomes: Number of flights by outcome.
         succeeded: Success rate, and the ends of its 95 % interval (Wilson).
         flight_time_s: Smallest, median and largest time of a successful flight, s.
-        apart_m: Largest distance of each later successful flight from the path of the first one, m:
-            median and maximum over these flights.
+        apart_m: Largest distance between the path of each later successful flight and that of the
+            first one, m: median and maximum over these flights.
     """
 
     outcomes: dict[str, int]
@@ -44,11 +44,8 @@ class Spread:
         share = wilson(len(good), len(runs))
         qualities = [run.record.quality_of_flight for run in good]
         times = sorted(own.flight_time_s for own in qualities if own.flight_time_s is not None)
-        apart = []
-        for run in good[1:]:
-            first = FlownPath.of(good[0].folder.path)
-            places = FlownPath.of(run.folder.path).places
-            apart.append(max(map(first.distance_m, places)))
+        paths = [FlownPath.of(run.folder.path) for run in good]
+        apart = [paths[0].apart_m(path) for path in paths[1:]]
         return cls(
             outcomes=dict(Counter(run.record.outcome for run in runs)),
             succeeded=(share.share, share.low, share.high),

@@ -1,5 +1,6 @@
 """Flights of a user's own companion: the outcome, the record, and what becomes of bad ones."""
 
+import math
 import os
 import sys
 from dataclasses import replace
@@ -7,6 +8,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from made_flights import companion_gate
 
@@ -21,6 +24,8 @@ from mavfi_cli.core.flight_record import ProgramEnds
 from mavfi_cli.link.codec import Codec
 from mavfi_cli.mission.crew import Crew
 from mavfi_cli.mission.run import fly_again
+from mavfi_cli.mission.run_folder import RunFolder
+from mavfi_cli.mission.success import SuccessVerdict
 from mavfi_cli.report.summary import summary_lines
 from mavfi_cli.report.top_view import draw_top_view
 from mavfi_cli.report.view.entries import ViewedFlight
@@ -110,7 +115,7 @@ def test_every_end_is_a_result(fly, end, options, outcome, reason):
 @pytest.mark.parametrize("gated", [False, True])
 def test_another_commander_is_told_once(fly, gated):
     second = f"[program.second]\ncommand = '{sys.executable} {HOP} {{link}} {SPEED} lands 190'\n"
-    run = fly("lands", program=second, gated=gated, limit_s=10.0)
+    run = fly("lands", program=second, gated=gated)
     texts = [event.text for event in run.record.events]
     assert sum("sends setpoints" in text for text in texts) == 1
 
@@ -167,6 +172,20 @@ def test_a_corridor_around_the_golden_path(fly):
     strayed = fly("lands", success=strict)
     assert strayed.record.outcome == "timeout"
     assert strayed.record.reason.endswith("m from the golden path")
+
+
+def test_a_flight_that_stops_early_misses_a_part_of_the_golden_path(tmp_path):
+    places = np.linspace(0.0, 10.0, 21)
+    table = pa.table({"x_m": places, "y_m": 0.0 * places, "z_m": 0.0 * places})
+    pq.write_table(table, RunFolder(tmp_path).trace)
+    success = SuccessConfig(landed=True, corridor_m=3.0, golden=str(tmp_path))
+    verdict = SuccessVerdict(success, crew=None)
+    verdict.goal_enu_m = np.zeros(3)
+    for x_m, text in ((4.0, "part of the golden path was missed by 6.0 m"), (7.0, ""),
+                      (math.nan, ""), (14.0, "up to 4.0 m from the golden path")):  # fmt: skip
+        for passed_m in np.linspace(0.0, x_m, 21):
+            verdict.see(SimpleNamespace(position_enu_m=np.array([passed_m, 0.0, 0.0])))
+        assert verdict.deviation() == text
 
 
 @pytest.mark.parametrize(

@@ -298,9 +298,9 @@ def test_a_process_is_gone_before_its_parent_has_awaited_it():
 def test_an_unexpected_error_ends_the_worker_and_not_the_gate(monkeypatch):
     worker = gate_process._Worker(None, None, None, None)
     monkeypatch.setattr(worker, "_route", lambda alive, judges: 1 / 0)
-    assert gate_process._supervise(worker, (), judges=True) is None
+    assert gate_process._watched(worker, (), judges=True) is None
     monkeypatch.setattr(worker, "_route", lambda alive, judges: None)
-    assert gate_process._supervise(worker, (), judges=True) == 0
+    assert gate_process._watched(worker, (), judges=True) == 0
 
 
 @contextlib.contextmanager
