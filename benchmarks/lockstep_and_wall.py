@@ -1,4 +1,4 @@
-r"""Compares the rates at which faults lose flights in lockstep and in real time.
+r"""Compares the rates at which faults lose flights in two campaigns: in lockstep and in real time.
 
     python benchmarks/lockstep_and_wall.py docs/results/own-lockstep-faults.parquet \
         docs/results/own-wall-faults.parquet
@@ -12,6 +12,7 @@ that struck count. A fault is dead if its process ended.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 from exported import Row, arguments, flown, lost, share
 
@@ -22,10 +23,11 @@ MARGIN = 0.15
 
 def main() -> None:
     """Read the exports, and print the rates, their difference and the verdict."""
-    sides = [flown([part]) for part in arguments(__doc__).parse_args().parts]
+    parts = arguments(__doc__).parse_args().parts
+    sides = [flown([part]) for part in parts]
     golden = [[row for row in side if row["injected"] == "golden"] for side in sides]
     struck = [[row for row in side if row["activation"]] for side in sides]
-    print("| | in lockstep | in real time | difference |\n|---|---|---|---|")
+    print(f"| | {' | '.join(Path(part).stem for part in parts)} | difference |\n|---|---|---|---|")
     _compare("golden flights lost", golden, lost)
     low, high = _compare("lost, of the faults that struck", struck, lost)
     _compare("dead, of the faults that struck", struck, lambda row: bool(row["node_ended"]))
@@ -37,8 +39,8 @@ def main() -> None:
 def _compare(name: str, sides: list[list[Row]], what: Callable[[Row], bool]) -> tuple[float, float]:
     """Print both rates and their difference, and return the interval of the difference."""
     counts = [(sum(map(what, side)), len(side)) for side in sides]
-    lockstep, wall = (wilson(*pair) for pair in counts)
-    gap = wall.minus(lockstep)
+    first, second = (wilson(*pair) for pair in counts)
+    gap = second.minus(first)
     cells = " | ".join(share(*pair) for pair in counts)
     print(f"| {name} | {cells} | {gap.value:+.0%} ({gap.low:+.0%} to {gap.high:+.0%}) |")
     return gap.low, gap.high
