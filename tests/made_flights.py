@@ -22,7 +22,7 @@ from mavfi_cli.campaigns.missions import (
     canonical,
     changes_of,
 )
-from mavfi_cli.core.types import Command
+from mavfi_cli.core.types import Command, Trajectory
 from mavfi_cli.detect.fit import fit
 from mavfi_cli.detect.offline import Dataset, FlightSamples
 from mavfi_cli.detect.preprocess import PreprocessParams
@@ -275,9 +275,9 @@ def watched(detector, gate_s, alarms=(), **detection):
 
 
 def companion_gate(companion, threshold):
-    """A range detector for a companion's file, which knows speeds up to 3 m/s.
+    """A range detector for a companion's file, which knows any state, and speeds up to 3 m/s.
 
-    Its ten flights have random velocities, of which every second is zero.
+    Its ten flights have random states and velocities, of which every second is zero.
     """
 
     def flown(seed):
@@ -287,7 +287,13 @@ def companion_gate(companion, threshold):
             velocity = rng.uniform(-3.0, 3.0, 3) * (number % 2)
             return Command(stamp_s=0.0, velocity_enu_mps=velocity, yaw_rad=0.0)
 
-        ticks = ((0.1 * number, None, command(number)) for number in range(60))
+        def plan(number):
+            return Trajectory(
+                stamp_s=0.1 * number, waypoints=rng.uniform(-30.0, 30.0, (1, 10)) * (number % 2),
+                durations_s=np.ones(1), trajectory_seq=0, future_collision_seq=0,
+            )  # fmt: skip
+
+        ticks = ((0.1 * number, plan(number), command(number)) for number in range(60))
         return FlightSamples.of_ticks(ticks, "farm", seed)
 
     samples = tuple(map(flown, range(10)))
