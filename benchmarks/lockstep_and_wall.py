@@ -1,6 +1,8 @@
-r"""Compares the rates at which faults lose flights in two campaigns: in lockstep and in real time.
+r"""Compares the rates at which faults lose flights of mavfi's own companion in two campaigns.
 
     python benchmarks/lockstep_and_wall.py docs/results/own-lockstep-faults.parquet \
+        docs/results/own-wall-faults.parquet
+    python benchmarks/lockstep_and_wall.py docs/results/own-built-in-faults.parquet \
         docs/results/own-wall-faults.parquet
 
 Reads two exports of campaigns (`mavfi campaign export`), and applies the rule in their

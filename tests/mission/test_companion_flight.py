@@ -25,7 +25,7 @@ from mavfi_cli.link.codec import Codec
 from mavfi_cli.mission.crew import Crew
 from mavfi_cli.mission.run import fly_again
 from mavfi_cli.mission.run_folder import RunFolder
-from mavfi_cli.mission.success import SuccessVerdict
+from mavfi_cli.mission.success import FlownPath, SuccessVerdict
 from mavfi_cli.report.summary import summary_lines
 from mavfi_cli.report.top_view import draw_top_view
 from mavfi_cli.report.view.entries import ViewedFlight
@@ -186,6 +186,13 @@ def test_a_flight_that_stops_early_misses_a_part_of_the_golden_path(tmp_path):
         for passed_m in np.linspace(0.0, x_m, 21):
             verdict.see(SimpleNamespace(position_enu_m=np.array([passed_m, 0.0, 0.0])))
         assert verdict.deviation() == text
+
+
+def test_the_distance_of_two_paths_is_the_same_in_both_directions():
+    short, long = (
+        FlownPath(np.linspace((0.0, 0.0, 0.0), (end_m, 0.0, 0.0), 5)) for end_m in (4.0, 10.0)
+    )
+    assert short.apart_m(long) == long.apart_m(short) == 6.0
 
 
 @pytest.mark.parametrize(
