@@ -15,7 +15,7 @@ from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.bits import NUMPY_TYPES
 from mavfi_cli.fi.fault import Effect, When
 from mavfi_cli.fi.injector import Injector, Listener, Moment, Pattern, change_of
-from mavfi_cli.link.codec import Message, Signing, renewed
+from mavfi_cli.link.codec import Message, Signing, frame_of, renewed
 from mavfi_cli.link.fields import is_ignored
 from mavfi_cli.link.router import Side
 from mavfi_cli.link.telemetry import ARDUCOPTER, PX4
@@ -62,14 +62,12 @@ class LinkInjector(Injector):
         self._count = 0
         self._swapped: dict[Side, Message] = {}
         self._late: list[tuple[float, Message, Side]] = []
-        self._locked = False  # a struck frame was signed with an unknown key
+        self._obstacle = ""  # the reason why a message could not be struck
 
     @property
     def missed(self) -> str:
         """The reason why the fault never struck, as text for the record."""
-        if self._locked:
-            return "the frames are signed, and key_file names no key to sign them again"
-        return super().missed
+        return self._obstacle or super().missed
 
     def pass_between(self, message: Message, side: Side, moment: Moment) -> list[Message]:
         """Return the messages to pass on in place of `message`.
@@ -111,11 +109,15 @@ class LinkInjector(Injector):
             changed = state.write(changed, 0, change.after)
             changes.append(change)
         valid = renewed(changed, self._signing)
+        flips = any(change.bits for change in changes)
         if valid is None:
-            self._locked = True
+            self._obstacle = "the frames are signed, and key_file names no key to sign them again"
+            return message
+        if flips and frame_of(valid) == frame_of(message):
+            self._obstacle = "the frames are MAVLink 1, which does not carry this field"
             return message
         self.side = side
-        struck = valid if any(change.bits for change in changes) else message
+        struck = valid if flips else message
         self.follower.struck(struck, self._record(moment, self._count, changes))
         return struck
 

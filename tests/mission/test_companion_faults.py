@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from live_processes import LONG_S
+from pymavlink.dialects.v10 import common as v10
 from pymavlink.dialects.v20 import ardupilotmega
 
 from mavfi_cli import library
@@ -135,6 +136,23 @@ def test_an_old_frame_keeps_its_length():
     (after,) = passed(injector(f"{SETPOINT}.vx", exact_bits=(30,)), [before])
     assert len(frame_of(after)) == len(frame)
     assert Codec(0, 0).decode(frame_of(after))[0].vx == 0.0
+
+
+def test_a_field_that_an_old_frame_does_not_carry_is_not_struck():
+    def link():
+        return injector("COMMAND_ACK.progress", exact_bits=(0,))
+
+    old = v10.MAVLink_command_ack_message(400, 0).pack(v10.MAVLink(None))
+    (before,) = Codec(0, 0).decode(old)
+    struck = link()
+    (after,) = passed(struck, [before], Side.AUTOPILOT)
+    assert after is before
+    assert "MAVLink 1" in struck.missed
+    (before,) = Codec(0, 0).decode(
+        dialect.MAVLink_command_ack_message(400, 0, 7).pack(dialect.MAVLink(None))
+    )
+    (after,) = passed(link(), [before], Side.AUTOPILOT)
+    assert after.progress == 6
 
 
 @pytest.mark.parametrize(
