@@ -1,6 +1,6 @@
 """MAVProxy, unchanged, flies 10 m ahead and lands: this script types what a pilot would type.
 
-Argument: the MAVLink URL of the vehicle.
+Arguments: the MAVLink URL of the vehicle, and its autopilot, px4 (the default) or ardupilot.
 """
 
 import importlib.util
@@ -12,14 +12,22 @@ import threading
 import time
 from pathlib import Path
 
-PREPARE = [
-    ("", r"Received \d+ parameters"),
-    ("long DO_SET_MODE 1 4 3 0 0 0 0", r"LOITER> "),
-    ("arm throttle", r"ARMED"),
-    ("long NAV_TAKEOFF 0 0 0 nan nan nan nan", r"TAKEOFF> (?s:.*)LOITER> "),
-]
-LAND = [("long NAV_LAND", r"LAND> (?s:.*)DISARMED")]
-OFFBOARD = "long DO_SET_MODE 1 6 0 0 0 0 0"
+PARAMETERS = [("", r"Received \d+ parameters")]
+TAKE_OFF = {
+    "px4": [
+        ("long DO_SET_MODE 1 4 3 0 0 0 0", r"LOITER> "),
+        ("arm throttle", r"ARMED"),
+        ("long NAV_TAKEOFF 0 0 0 nan nan nan nan", r"TAKEOFF> (?s:.*)LOITER> "),
+    ],
+    "ardupilot": [
+        ("set altreadout 2", ""),  # it then says every 2 m of height
+        ("mode GUIDED", r"GUIDED> "),
+        ("arm throttle", r"ARMED"),
+        ("takeoff 3", r"height [23]"),
+    ],
+}
+FOLLOW = {"px4": "long DO_SET_MODE 1 6 0 0 0 0 0", "ardupilot": "mode GUIDED"}
+LAND = {"px4": "long NAV_LAND", "ardupilot": "mode LAND"}
 
 program = Path(importlib.util.find_spec("MAVProxy").origin).with_name("mavproxy.py")
 folder = tempfile.TemporaryDirectory()  # for MAVProxy's logs
@@ -63,10 +71,11 @@ def fly(seconds, ahead_mps):
 
 
 threading.Thread(target=read, daemon=True).start()
-follow(PREPARE)
+autopilot = sys.argv[2] if len(sys.argv) > 2 else "px4"
+follow(PARAMETERS + TAKE_OFF[autopilot])
 fly(1, 0)  # OFFBOARD needs setpoints before it begins
-type_line(OFFBOARD)
+type_line(FOLLOW[autopilot])
 fly(5, 2)
-follow(LAND)
+follow([(LAND[autopilot], r"LAND> (?s:.*)DISARMED")])
 proxy.stdin.close()
 proxy.wait()
