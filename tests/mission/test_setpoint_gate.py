@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from importlib.metadata import EntryPoint, EntryPoints
 
 import numpy as np
 import pytest
@@ -16,11 +17,14 @@ from live_processes import LONG_S
 
 from mavfi_cli.cli.gate import gate as gate_command
 from mavfi_cli.cli.train import train as train_command
+from mavfi_cli.core import installed
 from mavfi_cli.core.errors import MavfiError, ModelError
 from mavfi_cli.core.types import Command, StackMark, Trajectory
+from mavfi_cli.detect import base
+from mavfi_cli.detect.base import PLUG_INS
 from mavfi_cli.detect.fit import fit
 from mavfi_cli.detect.offline import Dataset, FlightSamples
-from mavfi_cli.detect.preprocess import PreprocessParams
+from mavfi_cli.detect.preprocess import PreprocessParams, span
 from mavfi_cli.link.codec import Codec, Signing, dialect, frame_of, key_from_passphrase
 from mavfi_cli.link.router import Side
 from mavfi_cli.link.tlog import TlogWriter
@@ -142,6 +146,33 @@ def test_a_standstill_keeps_the_yaw_of_the_last_accepted_setpoint(model):
         for vx in (2.0, -1000.0, 2.0)
     ]
     assert passed == [2.0, 0.0, 2.0]
+
+
+class Steps:
+    """A plug-in without a model: the largest step of any state of a stage, in codes."""
+
+    name, per_stage, threshold = "steps", True, 8.0
+
+    def __init__(self, *, model, threshold):
+        self.memory = {}
+
+    def score(self, deltas, stage):
+        first, end = span(stage)
+        return float(np.abs(deltas[first:end].astype(int)).max())
+
+    def learn(self, deltas, stage):
+        pass
+
+
+def test_a_plug_in_judges_setpoints(monkeypatch):
+    entry = EntryPoint("steps", f"{__name__}:Steps", PLUG_INS.group)
+    monkeypatch.setattr(installed, "entry_points", lambda group: EntryPoints([entry]))
+    monkeypatch.setattr(base, "PLUG_INS", installed.PlugIns(PLUG_INS.group, "detector"))
+    own = SetpointGate(DetectorConfig(name="steps"), GateConfig(), MARK, note=lambda text: None)
+    for message in states(1000):
+        own.pass_between(message, Side.AUTOPILOT, 1.0)
+    assert velocities(own, [2.0, 2.0, -1000.0, 2.0]) == [[2.0], [2.0], [2.0], [2.0]]
+    assert own.summary()["responses"]["hold"] == 1
 
 
 @pytest.mark.parametrize("wild", [math.nan, math.inf, -3e38])
