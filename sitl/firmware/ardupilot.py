@@ -41,7 +41,7 @@ class ArduPilotLink:
     Port 0 selects any free port. Raises LinkError if the port cannot be opened.
     """
 
-    step_s = 0.0025  # ArduCopter's main loop runs at 400 Hz
+    step_s = 0.00125  # ArduCopter arms only if the gyro is faster than 1.8 times its loop of 400 Hz
     settle_s = 0.0  # its boot takes the same simulated time in every flight
     echoes = False
 

@@ -16,6 +16,7 @@ import pytest
 from pages import block
 
 from mavfi_cli import library
+from mavfi_cli.spec.mission import FIRMWARE
 
 _MODULES = "param,arm,mode,cmdlong,misc"
 
@@ -191,12 +192,20 @@ def test_mavproxy_loads_its_modules_and_fetches_parameters_again(sitl, connect, 
 
 
 @pytest.mark.slow
-def test_mavproxy_flies_as_a_companion(tmp_path):
+@pytest.mark.parametrize("autopilot", ["ours", "ardupilot"])
+def test_mavproxy_flies_as_a_companion(tmp_path, autopilot):
+    if autopilot in FIRMWARE and not os.environ.get(FIRMWARE[autopilot]):
+        pytest.skip(f"{FIRMWARE[autopilot]} names no SITL binary of {autopilot}")
     script = Path(__file__).with_name("mavproxy_flight.py")
+    kind = "px4" if autopilot == "ours" else autopilot
     companion = tmp_path / "mavproxy.toml"
     companion.write_text(
-        f"camera_heartbeat = false\n[program.fly]\ncommand = '{sys.executable} {script} {{link}}'\n"
+        "camera_heartbeat = false\n"
+        f"[program.fly]\ncommand = '{sys.executable} {script} {{link}} {kind}'\n"
     )
-    run = library.fly(companion=str(companion), world="farm", time_limit_s=60.0, out=tmp_path)
+    run = library.fly(
+        companion=str(companion), autopilot=autopilot, world="farm", time_limit_s=60.0,
+        out=tmp_path,
+    )  # fmt: skip
     assert (run.record.outcome, run.record.reason) == ("success", "fly ended with code 0")
     assert run.record.quality_of_flight.distance_m > 14.0
