@@ -468,10 +468,17 @@ AvailableModes = _message_class(
 ADDED: dict[int, Any] = {
     message.id: message for message in (ProtocolVersion, ComponentMetadata, AvailableModes)
 }
-"""The message classes besides those of the dialect, keyed by message id.
+"""The message classes besides those of the dialect, keyed by message id."""
 
-`WireFields.of` adds those of ArduPilot that a fault strikes.
-"""
+
+def add_ardupilot() -> None:
+    """Let all codecs of this process encode and decode ArduPilot's own messages, too."""
+    from pymavlink.dialects.v20 import ardupilotmega  # slow to load
+
+    for number, kind in ardupilotmega.mavlink_map.items():
+        if number not in dialect.mavlink_map:
+            ADDED.setdefault(number, kind)
+
 
 SLOW_STREAMS_US = {
     dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 2e5,

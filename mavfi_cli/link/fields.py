@@ -14,7 +14,7 @@ from typing import Any
 
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import DType, Scalar, State
-from mavfi_cli.link.codec import ADDED, Message, dialect
+from mavfi_cli.link.codec import ADDED, Message, add_ardupilot, dialect
 
 _TYPES = {
     "float": DType.FLOAT32, "double": DType.FLOAT64, "char": DType.UINT8,
@@ -73,23 +73,19 @@ class WireFields:
     def of(cls, name: str) -> WireFields:
         """Return the fields of the message type `name`.
 
-        If only ArduPilot has this message, every codec of the process decodes it from now on.
+        If only ArduPilot has this message, all codecs of the process decode ArduPilot's messages
+        from now on.
 
         Raises:
             UnknownName: Neither the `common` dialect nor ArduPilot has such a message. The error
                 suggests the nearest.
         """
-        kinds = {kind.msgname: kind for kind in (*dialect.mavlink_map.values(), *ADDED.values())}
-        if name not in kinds:
-            from pymavlink.dialects.v20 import ardupilotmega  # slow to load
-
-            kinds = {kind.msgname: kind for kind in ardupilotmega.mavlink_map.values()} | kinds
-        if name not in kinds:
+        if name not in (kinds := _kinds()):
+            add_ardupilot()
+        if name not in (kinds := _kinds()):
             near = difflib.get_close_matches(name, kinds, 6, 0.0)
             raise UnknownName("message", name, near)
         kind: Any = kinds[name]
-        if kind.id not in dialect.mavlink_map:
-            ADDED[kind.id] = kind
         states: dict[str, State] = {}
         of_fields = zip(kind.fieldnames, kind.fieldtypes, strict=True)
         counts = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
@@ -106,6 +102,11 @@ class WireFields:
                     full, kind, source, unit, column=column, dtype=dtype, group=f"{name}.{shared}"
                 )
         return cls(name=name, number=kind.id, states=states)
+
+
+def _kinds() -> dict[str, Any]:
+    """Return the known message classes by name."""
+    return {kind.msgname: kind for kind in (*dialect.mavlink_map.values(), *ADDED.values())}
 
 
 def is_ignored(message: Message, state: State) -> bool:

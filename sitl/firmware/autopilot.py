@@ -89,7 +89,7 @@ class FirmwareAutopilot(Links):
 
     It requests the streams that a flight needs, and sets the firmware's local origin to the
     world's, so that the firmware reports world coordinates. Clients of any preset get all of the
-    firmware's `common` messages.
+    firmware's messages that the codecs know.
 
     Args:
         echoes: Whether the firmware answers TIMESYNC while its clock stands still. If so, simulated

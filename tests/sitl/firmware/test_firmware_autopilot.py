@@ -6,8 +6,10 @@ import math
 import socket
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega
 
 from mavfi_cli.core.errors import VehicleProcessError
+from mavfi_cli.link import codec
 from mavfi_cli.link.codec import Codec, Message, dialect
 from mavfi_cli.link.transport import Transport
 from sitl.autopilot.telemetry import Preset
@@ -39,6 +41,31 @@ def test_its_messages_reach_every_client(
         assert kinds == ["HEARTBEAT", "LOCAL_POSITION_NED"]
         assert autopilot.collect(link) == []
     assert autopilot.state_stamp_us == 14_004_000
+
+
+def test_messages_that_only_ardupilot_has_pass_both_ways(
+    wired: tuple[FirmwareAutopilot, socket.socket],
+    resting: Truth,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(codec, "ADDED", codec.ADDED.copy())
+    monkeypatch.setattr(codec, "_KINDS", codec._KINDS.copy())
+    codec.add_ardupilot()
+    autopilot, theirs = wired
+    link = autopilot.open_link(Preset.ONBOARD)
+    sender = ardupilotmega.MAVLink(None, srcSystem=1, srcComponent=1)
+    report = ardupilotmega.MAVLink_ekf_status_report_message(831, 0.1, 0.2, 0.3, 0.4, 0.5)
+    theirs.sendall(PX4_HEARTBEAT + report.pack(sender))
+    autopilot.observe(20_000, resting)
+    told = autopilot.collect(link)[-1]
+    assert (told.get_type(), told.flags) == ("EKF_STATUS_REPORT", 831)
+    _heard(theirs)
+    wish = ardupilotmega.MAVLink_autopilot_version_request_message(1, 1)
+    (heard,) = Codec(0, 0).decode(wish.pack(ardupilotmega.MAVLink(None, 255, 190)))
+    autopilot.handle(heard, link)
+    autopilot.deliver()
+    (passed,) = _heard(theirs)
+    assert (passed.get_type(), passed.get_srcSystem()) == ("AUTOPILOT_VERSION_REQUEST", 255)
 
 
 @pytest.mark.parametrize("stranger", [(1, 190), (7, 1)])
