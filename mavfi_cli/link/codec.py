@@ -261,6 +261,15 @@ class Codec:
         self.unknown = 0  # skipped frames whose id the dialect lacks
         self.refused = 0  # frames that signing rejected
 
+    @staticmethod
+    def add_ardupilot() -> None:
+        """Let all codecs of this process encode and decode ArduPilot's own messages, too."""
+        from pymavlink.dialects.v20 import ardupilotmega  # slow to load
+
+        for number, kind in ardupilotmega.mavlink_map.items():
+            if number not in dialect.mavlink_map:
+                ADDED.setdefault(number, kind)
+
     def encode(self, message: Message) -> bytes:
         """Encode a message as a MAVLink 2 frame. The message itself does not change.
 
@@ -469,16 +478,6 @@ ADDED: dict[int, Any] = {
     message.id: message for message in (ProtocolVersion, ComponentMetadata, AvailableModes)
 }
 """The message classes besides those of the dialect, keyed by message id."""
-
-
-def add_ardupilot() -> None:
-    """Let all codecs of this process encode and decode ArduPilot's own messages, too."""
-    from pymavlink.dialects.v20 import ardupilotmega  # slow to load
-
-    for number, kind in ardupilotmega.mavlink_map.items():
-        if number not in dialect.mavlink_map:
-            ADDED.setdefault(number, kind)
-
 
 SLOW_STREAMS_US = {
     dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 2e5,

@@ -14,7 +14,7 @@ from typing import Any
 
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import DType, Scalar, State
-from mavfi_cli.link.codec import ADDED, Message, add_ardupilot, dialect
+from mavfi_cli.link.codec import ADDED, Codec, Message, dialect
 
 _TYPES = {
     "float": DType.FLOAT32, "double": DType.FLOAT64, "char": DType.UINT8,
@@ -81,7 +81,7 @@ class WireFields:
                 suggests the nearest.
         """
         if name not in (kinds := _kinds()):
-            add_ardupilot()
+            Codec.add_ardupilot()
         if name not in (kinds := _kinds()):
             near = difflib.get_close_matches(name, kinds, 6, 0.0)
             raise UnknownName("message", name, near)

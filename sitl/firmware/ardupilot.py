@@ -18,7 +18,7 @@ import numpy as np
 from mavfi_cli.core.errors import LinkError, VehicleProcessError
 from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.frames import Vector
-from mavfi_cli.link.codec import add_ardupilot
+from mavfi_cli.link.codec import Codec
 from sitl.firmware.autopilot import FIXED_PARAMETERS, Boot, FirmwareProcess
 from sitl.firmware.sensors import Sensors
 from sitl.geodesy import Origin
@@ -47,7 +47,7 @@ class ArduPilotLink:
     echoes = False
 
     def __init__(self, sensors: Sensors, port: int = PORT) -> None:
-        add_ardupilot()  # clients such as DroneKit read EKF_STATUS_REPORT
+        Codec.add_ardupilot()  # clients such as DroneKit read EKF_STATUS_REPORT
         self._sensors = sensors
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:

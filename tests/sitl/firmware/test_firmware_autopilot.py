@@ -50,7 +50,7 @@ def test_messages_that_only_ardupilot_has_pass_both_ways(
 ) -> None:
     monkeypatch.setattr(codec, "ADDED", codec.ADDED.copy())
     monkeypatch.setattr(codec, "_KINDS", codec._KINDS.copy())
-    codec.add_ardupilot()
+    Codec.add_ardupilot()
     autopilot, theirs = wired
     link = autopilot.open_link(Preset.ONBOARD)
     sender = ardupilotmega.MAVLink(None, srcSystem=1, srcComponent=1)
