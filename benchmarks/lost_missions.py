@@ -6,7 +6,9 @@ r"""Counts the lost and the longer missions of flown campaigns, per cell.
 Reads exports of campaigns (`mavfi campaign export`). A cell counts golden missions, and missions
 whose fault was read. A mission is lost if it does not end in success. It is longer if it succeeds
 and takes more than 10 % longer than its own golden flight: the flight without a fault with the same
-world, world seed, seed, stack and platform. Intervals are Wilson's, 95 %.
+world, world seed, seed, stack and platform, and without a detector. The last column counts the
+missions with an alarm of a detector, and the alarms per hour of flight. Intervals are Wilson's,
+95 %.
 """
 
 from __future__ import annotations
@@ -21,7 +23,11 @@ from mavfi_cli.analysis.pairs import LONGER
 
 def lines(rows: list[Row], by: Sequence[str]) -> list[str]:
     """Return a row of the table for each cell, which is a combination of values of the columns."""
-    golden = {key(r, PAIRED): r["flight_time_s"] for r in rows if r["injected"] == "golden"}
+    golden = {
+        key(row, PAIRED): row["flight_time_s"]
+        for row in rows
+        if row["injected"] == "golden" and not row["detector"]
+    }
     counted = (r for r in rows if r["injected"] == "golden" or r["activation"] == "read")
     printed = []
     for name, cell in cells(counted, by).items():
@@ -32,16 +38,26 @@ def lines(rows: list[Row], by: Sequence[str]) -> list[str]:
         text = ", ".join(f"{count} {outcome}" for outcome, count in sorted(ends.items()))
         printed.append(
             f"| {' | '.join(name)} | {share(len(failed), len(cell))} | {longer} of {len(paired)} "
-            f"| {text} |"
+            f"| {text} | {_alarms(cell)} |"
         )
     return printed
+
+
+def _alarms(cell: list[Row]) -> str:
+    watched = [row for row in cell if row["detector"]]
+    if not watched:
+        return ""
+    alarmed = sum(bool(row["alarm_count"]) for row in watched)
+    hours = sum(row["flight_time_s"] or 0.0 for row in watched) / 3600.0
+    rate = sum(row["alarm_count"] or 0 for row in watched) / hours
+    return f"in {alarmed} of {len(watched)}, {rate:.3g} an hour"
 
 
 def main() -> None:
     """Read the exports, and print the table."""
     given = arguments(__doc__, by=["world"]).parse_args()
-    print(f"| {' | '.join(given.by)} | lost | longer by > 10 % | ends |")
-    print("|---" * (len(given.by) + 3) + "|")
+    print(f"| {' | '.join(given.by)} | lost | longer by > 10 % | ends | alarms |")
+    print("|---" * (len(given.by) + 4) + "|")
     print("\n".join(lines(flown(given.parts), given.by)))
 
 
