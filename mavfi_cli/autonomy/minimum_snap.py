@@ -9,7 +9,7 @@ solver of mav_trajectory_generation (Richter, Bry and Roy 2013) with these condi
   the spline of degree 7 with six continuous derivatives whose fourth and fifth derivatives vanish
   at both ends. A single segment is therefore a cubic.
 - A segment of length d lasts 2 d / v (1 + 6.5 v / a exp(-2 d / v)), with v = v_max and a = a_max:
-  33 s for 50 m, and 4.4 s for 1 m.
+  33 s for 50 m, and 2.0 s for 1 m.
 - A segment that is not free gets a vertex in the middle of its straight line, and the whole path is
   solved again, up to 40 times. More vertices mean shorter segments, so the vehicle is slow where
   the path is narrow.

@@ -1,8 +1,8 @@
 """The claims, and the verdicts that compare a claim's effect with its range.
 
-The ranges in claims.toml were written before the data existed. A verdict tests the effect against
-the nearest end of the range. The tests of one figure or table form a family, corrected by Holm's
-method (S. Holm, Scand. J. Statistics 6, 1979).
+The ranges in claims.toml come from the paper alone, not from our missions. A verdict tests the
+effect against the nearest end of the range. The tests of one figure or table form a family,
+corrected by Holm's method (S. Holm, Scand. J. Statistics 6, 1979).
 """
 
 from __future__ import annotations
