@@ -312,16 +312,16 @@ class Safeguard:
 
 
 def protections(flights: Mapping[str, Flights]) -> list[Safeguard]:
-    """Judge each detector at the first place, and each other stack as a substitute for the first.
+    """Judge each detector at the first place, and our own stack as a substitute for the first.
 
-    Detectors and stacks are omitted if nothing was flown to judge them.
+    Detectors and the stack are omitted if nothing was flown to judge them.
 
     Args:
         flights: flights by place, from `Evidence.by_place`.
     """
     name, first = next(iter(flights.items()))
     own = [place for place in flights if stack_of(place) == stack_of(name)]
-    others = [place for place in flights if place not in own]
+    others = [place for place in flights if place not in own and stack_of(place) == STACKS[-1]]
     safeguards = [
         Safeguard(
             name=f"{title} detector",

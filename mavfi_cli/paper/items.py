@@ -25,7 +25,7 @@ from mavfi_cli.report.paper import PaperColumn, PaperRow, PaperTable, Printed
 
 _PAPER, _ = read_toml(Path(__file__).parent / "paper.toml")
 _META = "reproduction"  # key of the ledger's `meta`
-STACKS = ("mavbench", "hardened")  # the paper's stack, and ours
+STACKS = ("mavbench", "mavbench-replica", "hardened")  # the paper's, rebuilt twice, and ours
 WORLDS = {"fixed": "fixed worlds", "many": "another world for each seed"}  # kinds, as --worlds
 OUT, KERNELS_FOLDER = Path("reproduction"), "kernels"
 Key = str  # the configuration of a mission as text; equal missions have equal keys

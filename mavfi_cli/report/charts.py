@@ -91,7 +91,7 @@ class ForestRow:
 
 
 _FOREST_IN = {"one": 2.9, "two": 4.3}
-_MARKS = (("o", 3.2, -0.2), ("D", 2.2, 0.12), ("s", 2.2, 0.36))  # mark, size, and place in a row
+_MARKS = (("o", 3.2), ("D", 2.0), ("s", 2.0), ("^", 2.2), ("v", 2.2), ("p", 2.2))  # mark, size
 _GAPS = {"one": "\n", "two": " "}  # between the halves of an axis label
 
 
@@ -99,7 +99,7 @@ def draw_forest(rows: Sequence[ForestRow], places: Sequence[str], columns: str =
     """Draw a row per claim: the claimed range as a band, and the effects at the places on it.
 
     Args:
-        places: names of up to three stacks, or stacks in one kind of worlds.
+        places: names of up to six stacks, or stacks in one kind of worlds.
         columns: `one` on a narrow screen, otherwise `two`.
     """
     from matplotlib.lines import Line2D
@@ -109,7 +109,8 @@ def draw_forest(rows: Sequence[ForestRow], places: Sequence[str], columns: str =
     gap = _GAPS[columns]
     parts = [part for kind in (False, True) if (part := [x for x in rows if x.number is kind])]
     heights = [len(part) + 1 for part in parts]
-    figure = new_figure(_FOREST_IN[columns], 0.7 + 0.117 * sum(heights))
+    row_in = 0.117 + 0.02 * max(0, len(places) - 3)
+    figure = new_figure(_FOREST_IN[columns], 0.7 + row_in * sum(heights))
     grid = figure.subplots(len(parts), 1, height_ratios=heights, squeeze=False)
     for axes, part in zip(grid[:, 0], parts, strict=True):
         numbers = part[0].number
@@ -129,7 +130,10 @@ def draw_forest(rows: Sequence[ForestRow], places: Sequence[str], columns: str =
             axes.barh(y, high - low, left=low, height=0.86, color=_BAND, linewidth=0)
             for place, effect in enumerate(row.effects):
                 if effect is not None:
-                    _effect(axes, y, effect, scale, place, row.verdict)
+                    down = (
+                        -0.2 if not place else 0.12 + 0.24 * (place - 1) / max(1, len(places) - 2)
+                    )
+                    _effect(axes, y + down, effect, scale, place, row.verdict)
         axes.set_yticks(range(len(part)), [row.label for row in part], fontsize=6.2)
         axes.set_ylim(len(part) - 0.4, -0.6)
         shares = ("points or per cent", "(logarithmic beyond 1)")
@@ -139,7 +143,7 @@ def draw_forest(rows: Sequence[ForestRow], places: Sequence[str], columns: str =
     marks += [
         Line2D([], [], marker=mark, markersize=size, color=NOTE, linewidth=0.9, label=name,
                markerfacecolor=NOTE if not place else "none")
-        for place, (name, (mark, size, _)) in enumerate(zip(places, _MARKS, strict=False))
+        for place, (name, (mark, size)) in enumerate(zip(places, _MARKS, strict=False))
         if any(any(row.effects[place : place + 1]) for row in rows)
     ]  # fmt: skip
     wide = 3 if len(marks) <= 3 else 2
@@ -149,16 +153,15 @@ def draw_forest(rows: Sequence[ForestRow], places: Sequence[str], columns: str =
 
 
 def _effect(axes: Axes, y: float, effect: Interval, scale: float, place: int, verdict: str) -> None:
-    """Draw the effect at place number `place` with its interval.
+    """Draw the effect at place number `place` with its interval at height `y`.
 
     The effect at the first place has the colour of the verdict.
     """
     colour = _VERDICTS.get(verdict, NOTE) if not place else NOTE
-    mark, size, down = _MARKS[place]
-    height, width = y + down, 0.6 if place else 1.3
+    mark, size = _MARKS[place]
     low, high = scale * effect.low, scale * effect.high
-    axes.hlines(height, low, high, color=colour, linewidth=width)
-    axes.plot(scale * effect.value, height, mark, color=colour,
+    axes.hlines(y, low, high, color=colour, linewidth=0.6 if place else 1.3)
+    axes.plot(scale * effect.value, y, mark, color=colour,
               markersize=size, markerfacecolor=colour if not place else "none",
               markeredgewidth=0.6)  # fmt: skip
 
