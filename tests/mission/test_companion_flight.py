@@ -168,8 +168,7 @@ def test_a_corridor_around_the_golden_path(fly):
     golden = fly("lands")
     near = f"landed = true\ncorridor_m = 3.0\ngolden = '{golden.folder.path}'"
     assert fly("lands", success=near).record.outcome == "success"
-    strict = near.replace("3.0", "0.01")
-    strayed = fly("lands", success=strict)
+    strayed = fly("lands", success=near, world_seed=9)  # starts elsewhere
     assert strayed.record.outcome == "timeout"
     assert strayed.record.reason.endswith("m from the golden path")
 
