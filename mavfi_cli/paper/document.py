@@ -230,7 +230,11 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         upsets_per_hour: bit flips that reach the injection sites per flight hour.
         step: called with the name of each step when it begins.
     """
-    flown = evidence.by_place(STACKS)
+    flown = {
+        place: mine
+        for place, mine in evidence.by_place(STACKS).items()
+        if len(mine) or place != STACKS[1]  # the second rebuild is shown only if it was flown
+    }
     places = sorted(flown, key=lambda place: not len(flown[place]))
     as_paper = {place: flown[place].chosen(as_paper=True) for place in places}
     flights = {place: those.chosen(at=(None, "random")) for place, those in as_paper.items()}
