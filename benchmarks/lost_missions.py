@@ -44,13 +44,14 @@ def lines(rows: list[Row], by: Sequence[str]) -> list[str]:
 
 
 def _alarms(cell: list[Row]) -> str:
-    watched = [row for row in cell if row["detector"]]
-    if not watched:
+    counts = [row.get("alarm_count") for row in cell if row["detector"]]
+    if not counts:
         return ""
-    alarmed = sum(bool(row["alarm_count"]) for row in watched)
-    hours = sum(row["flight_time_s"] or 0.0 for row in watched) / 3600.0
-    rate = sum(row["alarm_count"] or 0 for row in watched) / hours
-    return f"in {alarmed} of {len(watched)}, {rate:.3g} an hour"
+    if None in counts:
+        return "not recorded"
+    hours = sum(row["flight_time_s"] or 0.0 for row in cell if row["detector"]) / 3600.0
+    rate = f", {sum(counts) / hours:.3g} an hour" if hours else ""
+    return f"in {sum(map(bool, counts))} of {len(counts)}{rate}"
 
 
 def main() -> None:
