@@ -104,7 +104,7 @@ class WireFields:
         return cls(name=name, number=kind.id, states=states)
 
 
-def _kinds() -> dict[str, Any]:
+def _kinds() -> dict[str, type[Message]]:
     """Return the known message classes by name."""
     return {kind.msgname: kind for kind in (*dialect.mavlink_map.values(), *ADDED.values())}
 
