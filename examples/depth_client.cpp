@@ -1,5 +1,5 @@
 // Prints depth frames: g++ -o depth_client depth_client.cpp
-// mavfi fly --companion "./depth_client {depth} 10"
+// mavfi fly --companion "./depth_client {camera} 10"
 #include <algorithm>
 #include <cstdint>
 #include <cstdio>

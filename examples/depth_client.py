@@ -1,4 +1,4 @@
-"""Print depth frames: `mavfi fly --companion "python depth_client.py {depth} 10"`."""
+"""Print depth frames: `mavfi fly --companion "python depth_client.py {camera} 10"`."""
 
 import socket
 import struct

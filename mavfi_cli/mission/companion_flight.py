@@ -200,7 +200,7 @@ class CompanionFlight:
             "port": str(port),
             "free": str(_free_port()),
             "briefing": str(folder.briefing.resolve()),
-            **({} if depth is None else {"depth": str(depth)}),
+            **({} if depth is None else {"camera": str(depth)}),
             "world": self._config.world,
             "start": ",".join(f"{value:g}" for value in briefing.start_enu_m),
             "goal": ",".join(f"{value:g}" for value in briefing.goal_enu_m),

@@ -220,7 +220,7 @@ class VehicleProcess(Vehicle):
         self.depth = self._scratch.path / "depth"
         if config.companion is not None:
             companion = CompanionConfig.load(config.companion)
-            line += ["--depth", str(self.depth)] if companion.uses("depth") else []
+            line += ["--depth", str(self.depth)] if companion.uses("camera") else []
             line += [] if companion.camera_heartbeat else ["--camera-heartbeat", "0"]
         with theirs:
             try:

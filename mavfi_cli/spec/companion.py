@@ -23,7 +23,7 @@ ACTIONS, ON_ERROR = ("hold", "brake", "autopilot"), ("open", "closed")
 TIMES = ("wall", "lockstep")
 _ANY_PORT = {"wall": "udpin:127.0.0.1:0", "lockstep": "tcpin:127.0.0.1:0"}
 PLACEHOLDERS = (
-    "link", "mavsdk", "port", "free", "briefing", "depth", "world", "start", "goal", "seed",
+    "link", "mavsdk", "port", "free", "briefing", "camera", "world", "start", "goal", "seed",
 )  # fmt: skip
 # {{word}} stands for the text {word}; ${word} is a variable of a shell.
 _PLACEHOLDER = re.compile(r"\{\{([a-z]+)\}\}|(?<!\$)\{([a-z]+)\}")

@@ -36,7 +36,7 @@ def cpp(folder):
 def test_a_client_reads_the_frames_of_a_flight(tmp_path, client):
     companion = tmp_path / "hop.toml"
     companion.write_text(
-        f"[program.eyes]\ncommand = '{client(tmp_path)} {{depth}} {FRAMES}'\n"
+        f"[program.eyes]\ncommand = '{client(tmp_path)} {{camera}} {FRAMES}'\n"
         f"[program.hop]\ncommand = '{sys.executable} {HOP} {{link}} {SPEED} lands'\n"
         "[success]\nlanded = true\nexit = 'eyes'\n"
     )

@@ -274,7 +274,7 @@ def test_only_a_heartbeat_that_was_not_heard_before_makes_a_program_ready():
 def test_the_vehicle_makes_a_depth_socket_for_a_companion_that_uses_it():
     programs = {
         "a": ProgramConfig(command="true {link}"),
-        "b": ProgramConfig(command="true {depth}"),
+        "b": ProgramConfig(command="true {camera}"),
     }
     assert CompanionConfig(program=programs).uses("depth")
     assert not CompanionConfig(program={"a": programs["a"]}).uses("depth")
