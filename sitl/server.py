@@ -309,9 +309,7 @@ class _Realtime:
         signing = signing_from_file(options.key_file)
         self._clients: Peers[Client] = Peers(signing=signing, allow_unsigned=options.allow_unsigned)
         for preset, url in options.links:  # all share one signing, so no frame is accepted twice
-            signs = None if parse_endpoint(url).scheme == "fd" else signing
-            make = partial(Client, simulation, preset=preset, signing=signs)
-            self._clients.open(url, make)
+            self._clients.open(url, partial(Client, simulation, preset=preset, signing=signing))
         self._announced: Collision | None = None
 
     def run(self, stopped: Callable[[], bool]) -> None:

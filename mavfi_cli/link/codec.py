@@ -16,6 +16,7 @@ import hmac
 import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from operator import attrgetter
 from typing import Any
 
@@ -28,6 +29,7 @@ NEW_STREAM_SLACK = 60 * UNITS_PER_S  # maximum lag of a new stream's timestamp
 
 _TIMESTAMP_END = 2**48
 _LINK_ID = 0  # our channel's
+_SECOND_LINK_ID = 255  # of frames that are sent again
 _RADIO_STATUS = (
     109  # sent by telemetry radios, which hold no key; the guide recommends accepting it
 )
@@ -64,14 +66,14 @@ class Signing:
         self._next_timestamp = 0
         self._streams: dict[tuple[int, int, int], int] = {}
 
-    def sign(self, frame: bytes) -> bytes:
-        """Return the 13-byte signature block of a frame.
+    def sign(self, frame: bytes, link: int = _LINK_ID) -> bytes:
+        """Return the 13-byte signature block of a frame, with the link id `link`.
 
         `frame` must contain all bytes from the marker to the CRC, with the signed flag set.
         """
         timestamp = max(self._now(), self._next_timestamp) % _TIMESTAMP_END
         self._next_timestamp = timestamp + 1
-        block = bytes([_LINK_ID]) + timestamp.to_bytes(6, "little")
+        block = bytes([link]) + timestamp.to_bytes(6, "little")
         return block + self._digest(frame + block)
 
     def accept(self, frame: bytes, header: int, message_id: int, *, signed: bool) -> bool:
@@ -385,7 +387,7 @@ def renewed(message: Message, signing: Signing | None = None) -> Message | None:
     """
     old, kind = frame_of(message), _kind(type(message).id)
     assert kind is not None
-    payload, signed = kind.payload(message), old[0] == _V2 and bool(old[2] & _SIGNED)
+    payload, signed = kind.payload(message), _is_signed(old)
     if signed and signing is None:
         return None
     number = kind.number.to_bytes(3, "little")
@@ -401,6 +403,30 @@ def renewed(message: Message, signing: Signing | None = None) -> Message | None:
         frame += signing.renew(frame, old[-SIGNATURE_LENGTH:])
     message._msgbuf = frame
     return message
+
+
+def sent_again(message: Message, signing: Signing | None) -> Message | None:
+    """Return a message whose frame a receiver accepts after the original or after later frames.
+
+    A receiver rejects a signed frame whose time is not later than the newest of its stream. The
+    frame therefore gets a signature of the present with another link id, which is another stream.
+
+    Returns:
+        The message itself if its frame is not signed, otherwise a copy with the new signature; None
+        if the frame is signed and `signing` is None.
+    """
+    frame = frame_of(message)
+    if not _is_signed(frame):
+        return message
+    if signing is None:
+        return None
+    again, unsigned = copy(message), frame[:-SIGNATURE_LENGTH]
+    again._msgbuf = unsigned + signing.sign(unsigned, _SECOND_LINK_ID)
+    return again
+
+
+def _is_signed(frame: bytes) -> bool:
+    return frame[0] == _V2 and bool(frame[2] & _SIGNED)
 
 
 def begins_with_frame(data: bytes) -> bool:

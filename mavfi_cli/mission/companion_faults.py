@@ -15,7 +15,7 @@ from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.bits import NUMPY_TYPES
 from mavfi_cli.fi.fault import Effect, When
 from mavfi_cli.fi.injector import Injector, Listener, Moment, Pattern, change_of
-from mavfi_cli.link.codec import Message, Signing, frame_of, renewed
+from mavfi_cli.link.codec import Message, Signing, frame_of, renewed, sent_again
 from mavfi_cli.link.fields import is_ignored
 from mavfi_cli.link.router import Side
 from mavfi_cli.link.telemetry import ARDUCOPTER, PX4
@@ -24,6 +24,7 @@ from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.fault import PROCESS, FaultConfig, InstructionConfig
 
 _SIDES = {None: None, "output": Side.COMPANION, "input": Side.AUTOPILOT}
+_LOCKED = "the frames are signed, and key_file names no key to sign them again"
 _RECEIVERS = {Side.COMPANION: "autopilot", Side.AUTOPILOT: "companion"}
 
 
@@ -32,7 +33,8 @@ class LinkInjector(Injector):
 
     Args:
         shortest_flight_s, listener: As for `Injector`.
-        signing: Key with which struck frames are signed again; None for an unsigned link.
+        signing: Key with which struck, repeated and delayed frames are signed again; None for an
+            unsigned link.
 
     Attributes:
         units: Unit of each struck field by name; for a whole message, its name with an empty unit.
@@ -79,26 +81,34 @@ class LinkInjector(Injector):
             return [message]
         self._count += 1
         if side in self._swapped:
-            return [message, self._swapped.pop(side)]
+            return [message, self._again(self._swapped.pop(side))]
         if not self._due(moment, self._count):
             return [message]
         if self._states:
             return [self._corrupt(message, side, moment)]
+        effect = self._corruption.effect
+        if effect is not Effect.DROP and sent_again(message, self._signing) is None:
+            self._obstacle = _LOCKED
+            return [message]
         self.side = side
         self._record(moment, self._count, ())
-        effect = self._corruption.effect
         if effect is Effect.SWAP:
             self._swapped[side] = message
         elif effect is Effect.LATE:
             self._late.append((moment.stamp_s + self._corruption.amount, message, side))
-        return [message, message] if effect is Effect.TWICE else []
+        return [message, self._again(message)] if effect is Effect.TWICE else []
 
     def release(self, stamp_s: float) -> Iterator[tuple[Message, Side]]:
         """Yield the late messages that are due, with their senders."""
         due = [late for late in self._late if late[0] <= stamp_s]
         self._late = [late for late in self._late if late[0] > stamp_s]
         for _, message, side in due:
-            yield message, side
+            yield self._again(message), side
+
+    def _again(self, message: Message) -> Message:
+        again = sent_again(message, self._signing)
+        assert again is not None
+        return again
 
     def _corrupt(self, message: Message, side: Side, moment: Moment) -> Message:
         changed, changes = message, []
@@ -111,7 +121,7 @@ class LinkInjector(Injector):
         valid = renewed(changed, self._signing)
         flips = any(change.bits for change in changes)
         if valid is None:
-            self._obstacle = "the frames are signed, and key_file names no key to sign them again"
+            self._obstacle = _LOCKED
             return message
         if flips and frame_of(valid) == frame_of(message):
             self._obstacle = "the frames are MAVLink 1, which does not carry this field"

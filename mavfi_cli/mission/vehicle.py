@@ -221,6 +221,7 @@ class VehicleProcess(Vehicle):
         if config.companion is not None:
             companion = CompanionConfig.load(config.companion)
             line += ["--depth", str(self.depth)] if companion.uses("camera") else []
+            line += [] if companion.key_file is None else ["--key-file", companion.key_file]
             line += [] if companion.camera_heartbeat else ["--camera-heartbeat", "0"]
         with theirs:
             try:

@@ -207,8 +207,9 @@ class CompanionConfig:
         flight_s: Simulated time from arming over which random faults are drawn, s; None for the
             flight time of `success.golden` or, without it, the duration of a straight flight to the
             goal at the speed limit.
-        key_file: File with the signing passphrase of the link, relative to this file. A message
-            that a fault changes is signed again with it.
+        key_file: File with the signing passphrase of the link, relative to this file. The vehicle
+            then signs its messages and accepts only signed ones, and a message that a fault changes,
+            repeats or delays is signed again.
         gate: Behaviour of the gate with `--detector`.
         name: Name of the companion, which detector models that are fitted to it store; None for the
             name of its file, or "companion".
@@ -278,10 +279,13 @@ class CompanionConfig:
     def _check_lockstep(self) -> None:
         """Reject settings that lockstep does not support.
 
-        These are links other than `tcpin`, a second program, and settings that need the wall clock.
+        These are links other than `tcpin`, a key, a second program, and settings that need the wall
+        clock.
         """
         if not self.url.startswith("tcpin:"):
             raise ConfigError("must be a tcpin: URL in lockstep; UDP may lose ticks", key="link")
+        if self.key_file is not None:
+            raise ConfigError("has no effect in lockstep; remove it", key="key_file")
         if len(self.program) > 1:
             raise ConfigError("must contain only one program in lockstep", key="program")
         plain = ProgramConfig(command="true")

@@ -1,9 +1,11 @@
 """A companion in few lines: climbs, flies north, lands.
 
 Arguments: link, speed, how it ends, and its component id (191). It takes its time from
-the autopilot, so that load on the machine does not change its path.
+the autopilot, so that load on the machine does not change its path. It signs its frames with
+the passphrase HOP_KEY, if that is set.
 """
 
+import hashlib
 import os
 import struct
 import sys
@@ -13,6 +15,8 @@ from pymavlink import mavutil
 
 own = int(sys.argv[4]) if len(sys.argv) > 4 else 191
 link = mavutil.mavlink_connection(sys.argv[1], source_system=1, source_component=own)
+if passphrase := os.environ.get("HOP_KEY"):
+    link.setup_signing(hashlib.sha256(passphrase.encode()).digest())
 speed, end = float(sys.argv[2]), sys.argv[3]
 mav, common = link.mav, mavutil.mavlink
 VELOCITY = 0b1001_1100_0111  # ignores positions, accelerations and the yaw rate

@@ -127,6 +127,26 @@ def test_a_signed_frame_is_signed_again_and_stays_out_without_a_key():
     assert "key_file" in locked.missed
 
 
+@pytest.mark.parametrize(
+    ("effect", "numbers"),
+    [("twice", [0, 0, 1, 2, 3]), ("swap", [1, 0, 2, 3]), ("late=0.15", [1, 2, 3, 0])],
+)
+def test_a_signed_frame_arrives_twice_late_or_out_of_order(effect, numbers):
+    def signing():
+        return Signing(KEY, lambda: CLOCK)
+
+    codec = Codec(1, 191, signing=signing())
+    sent = [setpoint(number, codec) for number in range(4)]
+    link = injector(SETPOINT, effect=effect, signing=signing())
+    frames = [frame_of(m) for m in passed(link, sent)]
+    frames += [frame_of(m) for m, _ in link.release(1.0)]
+    receiver = Codec(0, 0, signing=signing())
+    assert [m.time_boot_ms for m in receiver.decode(b"".join(frames))] == numbers
+    locked = injector(SETPOINT, effect=effect)
+    assert passed(locked, sent) == sent
+    assert "key_file" in locked.missed
+
+
 def test_an_old_frame_keeps_its_length():
     old = dialect.MAVLink(None, srcSystem=1, srcComponent=191)
     frame = dialect.MAVLink_set_position_target_local_ned_message(

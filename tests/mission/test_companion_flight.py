@@ -30,7 +30,7 @@ from mavfi_cli.report.summary import summary_lines
 from mavfi_cli.report.top_view import draw_top_view
 from mavfi_cli.report.view.entries import ViewedFlight
 from mavfi_cli.spec.companion import CompanionConfig, ProgramConfig, SuccessConfig
-from mavfi_cli.spec.fault import InstructionConfig
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 HOP = Path(__file__).with_name("hop.py")
@@ -109,6 +109,17 @@ def test_every_end_is_a_result(fly, end, options, outcome, reason):
     record = fly(end, **options).record
     assert record.outcome == outcome
     assert reason in record.reason
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("signs", [True, False])
+def test_a_vehicle_with_a_key_obeys_only_a_companion_that_signs(fly, tmp_path, signs):
+    (tmp_path / "key").write_text("horse\n")
+    key = "environment = { HOP_KEY = 'horse', MAVLINK20 = '1' }" if signs else ""
+    fault = FaultConfig(target="SET_POSITION_TARGET_LOCAL_NED", effect="twice", at="time=5")
+    record = fly("lands", top="key_file = 'key'", program=key, fault=fault, limit_s=30.0).record
+    assert record.outcome == ("success" if signs else "timeout")
+    assert record.fault.state == ("applied" if signs else "not_injected")
 
 
 @pytest.mark.slow
@@ -276,8 +287,8 @@ def test_the_vehicle_makes_a_depth_socket_for_a_companion_that_uses_it():
         "a": ProgramConfig(command="true {link}"),
         "b": ProgramConfig(command="true {camera}"),
     }
-    assert CompanionConfig(program=programs).uses("depth")
-    assert not CompanionConfig(program={"a": programs["a"]}).uses("depth")
+    assert CompanionConfig(program=programs).uses("camera")
+    assert not CompanionConfig(program={"a": programs["a"]}).uses("camera")
 
 
 def test_placeholders_and_text_in_braces():
