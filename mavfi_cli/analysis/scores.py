@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from mavfi_cli.analysis.detectors import NONE, Scored, harmful
 from mavfi_cli.analysis.flights import chosen
-from mavfi_cli.core.errors import ModelError, RecordError
+from mavfi_cli.core.errors import MavfiError, ModelError, RecordError
 from mavfi_cli.core.files import Json, read_json, write_json
 from mavfi_cli.core.types import BY_NAME, Outcome, StackMark, Stage, Trajectory
 from mavfi_cli.detect.base import Model
@@ -196,11 +196,15 @@ def _is_error_free(run: Run, stack: StackMark) -> bool:
         record.outcome == Outcome.SUCCESS.value
         and faults == (None, None)
         and not (record.detection and record.detection.alarm_count)
-        and _mark_of(record.config).digest == stack.digest
+        and (record.mark or _digest_of(record.config)) == stack.digest
     )
 
 
-def _mark_of(config: Json) -> StackMark:
-    if companion := config.get("companion"):
-        return CompanionConfig.load(companion).mark
-    return load_stack(config["stack"]).mark
+def _digest_of(config: Json) -> str:
+    """Return the digest of what a configuration names, or "" if its file is gone or bad."""
+    companion = config.get("companion")
+    with contextlib.suppress(MavfiError):
+        if companion:
+            return CompanionConfig.load(companion, starts=False).mark.digest
+        return load_stack(config["stack"]).mark.digest
+    return ""

@@ -59,7 +59,7 @@ Row = tuple[str | None, str | None]  # outcome, fate of the fault
 
 WORK, PROFILES = "work", "profiles"
 ATTEMPTS = 3  # most attempts at a mission if something outside it ends them
-LIMIT_S = 900.0  # wall time of one mission; the slowest takes some twenty seconds
+LIMIT_S = 900.0  # wall time of one mission; the slowest in simulated time takes twenty seconds
 SHARING = 48  # most missions that share a flight
 _AHEAD = 5000  # missions to read ahead in search of some that share a flight
 _GIVE_UP = 5  # end the campaign after this many failed starts if no mission could begin
@@ -73,6 +73,7 @@ class Options:
     Attributes:
         jobs: number of concurrent missions.
         limit_s: wall time limit of one mission, in seconds; a longer mission is recorded as `hang`.
+            A mission that keeps pace with the wall clock gets its time limit in addition.
         task: name of the module that flies a mission.
         whole: fly every mission from its own start, instead of forking several from a shared
             flight. The records are the same.
@@ -496,7 +497,10 @@ class _Run:
                 self._attempts[number] += 1
                 self._flying[number] = mission
                 attempts.append((number, changes_of(config), self._made(number)))
-            workers.start(attempts, self._options.limit_s, alone)
+            workers.start(attempts, self._limit_s(missions[0].config), alone)
+
+    def _limit_s(self, config: MissionConfig) -> float:
+        return self._options.limit_s + config.paced_s
 
     def _next(self) -> list[MissingMission]:
         """Return the missions of the next flight: one, or several that share it."""
@@ -546,7 +550,7 @@ class _Run:
             self._attempts[number] -= 1
             self._again.append(mission)
             return
-        verdict = ended.judge(out, mission.config, self._options.limit_s)
+        verdict = ended.judge(out, mission.config, self._limit_s(mission.config))
         last = self._attempts[number] >= ATTEMPTS
         if (verdict.state is None or verdict.doubtful) and not last:
             self._repeated += 1

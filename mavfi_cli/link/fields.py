@@ -20,11 +20,15 @@ _TYPES = {
     "float": DType.FLOAT32, "double": DType.FLOAT64, "char": DType.UINT8,
     "uint8_t_mavlink_version": DType.UINT8,
 }  # fmt: skip
-_SETPOINTS = ("SET_POSITION_TARGET_LOCAL_NED", "SET_POSITION_TARGET_GLOBAL_INT")
-# Bits of their type_mask that make the autopilot ignore a field; see POSITION_TARGET_TYPEMASK.
+_SETPOINTS = (
+    "SET_POSITION_TARGET_LOCAL_NED", "SET_POSITION_TARGET_GLOBAL_INT", "SET_ATTITUDE_TARGET",
+)  # fmt: skip
+# Bits of a setpoint's type_mask that make the autopilot ignore a field; see
+# POSITION_TARGET_TYPEMASK and ATTITUDE_TARGET_TYPEMASK.
 _IGNORED = {
     "x": 1, "y": 2, "z": 4, "lat_int": 1, "lon_int": 2, "alt": 4, "vx": 8, "vy": 16, "vz": 32,
     "afx": 64, "afy": 128, "afz": 256, "yaw": 1024, "yaw_rate": 2048,
+    "body_roll_rate": 1, "body_pitch_rate": 2, "body_yaw_rate": 4, "thrust": 64, "q": 128,
 }  # fmt: skip
 
 

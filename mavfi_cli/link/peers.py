@@ -3,8 +3,8 @@
 A client of a TCP port becomes a peer when it connects, a sender to a UDP port with its first valid
 frame. `open_listener` bounds the number of peers and their waiting bytes. The source address of a
 datagram may be forged; replies then reach a host that has sent nothing. A peer on a UDP port
-therefore gets all messages only for a short time after a valid frame, and then fewer and fewer. It
-is removed after 30 s of silence.
+therefore gets all messages of `send_in_turn` only for a short time after a valid frame, and then
+fewer and fewer. It is removed after 30 s of silence.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Passes MAVLink frames between an autopilot and the programs of a companion, byte for byte.
 
 Every frame from one side reaches the other side. Frames from a program also reach the companion's
-other programs, as on a real autopilot's link. The owner may replace frames in transit.
+other programs, as on a real autopilot's link. The owner may replace frames in transit. A program on
+a UDP port gets every frame until it has been silent for 30 s.
 """
 
 from __future__ import annotations

@@ -52,8 +52,10 @@ def tlog_messages(path: Path) -> Iterator[tuple[float, Message]]:
     codec, start = Codec(0, 0), 0
     while (length := frame_length(data, start + 8, len(data))) > 0:
         unix_s = int.from_bytes(data[start : start + 8], "big") / 1e6
-        for message in codec.decode(data[start + 8 : start + 8 + length], datagram=True):
-            yield unix_s, message
+        frame = data[start + 8 : start + 8 + length]
+        yield from ((unix_s, message) for message in codec.decode(frame, datagram=True))
+        if codec.bad_bytes:
+            return
         start += 8 + length
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import math
+import os
 import select
 import socket
 import time
@@ -13,7 +14,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
-from mavfi_cli.core.errors import ConfigError, LinkError, LinkLost
+from mavfi_cli.core.errors import ConfigError, LinkError, LinkLost, RecordError
+from mavfi_cli.core.files import read_bounded
 from mavfi_cli.link.codec import (
     Codec,
     Signing,
@@ -32,6 +34,7 @@ _BACKLOG = 1 << 16  # buffer for a slow client of a listener, bytes
 _MAX_WAITING = 128  # maximum unread datagrams per peer; the oldest are dropped first
 _JUDGED = 16  # maximum datagrams from unknown senders that one pass examines; others are lost
 _PUMPED = 1000  # maximum datagrams that one pass reads
+_LONGEST_KEY = 1 << 16  # largest file of a passphrase, bytes
 _MTU_PAYLOAD = 1400  # maximum bytes per datagram when frames are combined
 
 
@@ -121,6 +124,7 @@ def open_transport(
     signed: bool = False,
     allow_unsigned: bool = False,
     admits: Callable[[bytes], bool] = begins_with_frame,
+    patient: bool = True,
 ) -> Transport:
     """Open the end of a link that `url` describes.
 
@@ -130,6 +134,8 @@ def open_transport(
         signed: The caller signs this link, so its address need not be a loopback address.
         allow_unsigned: Allow addresses other than loopback without signing.
         admits: Returns True if the sender of this datagram may become the peer of `udpin`.
+        patient: Wait for a slow reader. Otherwise the link buffers data for it, and drops the
+            oldest first.
 
     Raises:
         LinkError: The URL is malformed, its scheme is unknown, its port is in use, no peer listens,
@@ -137,14 +143,14 @@ def open_transport(
     """
     endpoint = parse_endpoint(url)
     if endpoint.scheme == "serial":
-        return _SerialPort(endpoint)
+        return _SerialPort(endpoint, patient=patient)
     if endpoint.scheme == "fd":
-        return _Stream(endpoint.inherited_socket(), url)
+        return _Stream(endpoint.inherited_socket(), url, patient=patient)
     opened = endpoint.open_socket(beyond=signed or allow_unsigned)
     if opened.type == socket.SOCK_DGRAM:
         return _Udp(opened, url, admits if endpoint.scheme == "udpin" else None)
     if endpoint.scheme == "tcp":
-        return _Stream(opened, url)
+        return _Stream(opened, url, patient=patient)
     return _FirstClient(_StreamListener(opened, url))
 
 
@@ -156,7 +162,9 @@ def open_listener(
     admits: Callable[[bytes], bool] = begins_with_frame,
     buffer: int = _BACKLOG,
 ) -> Listener:
-    """Open an endpoint that accepts several peers. Raises the same errors as `open_transport`.
+    """Open an endpoint that accepts several peers, none of which waits for a slow reader.
+
+    Raises the same errors as `open_transport`.
 
     Args:
         url, signed, allow_unsigned: As in `open_transport`. `url` may also be an open transport,
@@ -169,10 +177,11 @@ def open_listener(
     if isinstance(url, socket.socket):
         return _StreamListener(url, str(url.getsockname()), buffer)
     endpoint = parse_endpoint(url)
-    if endpoint.scheme == "fd":
-        return _OnePeer(_Stream(endpoint.inherited_socket(), url, patient=False))
     if endpoint.scheme not in LISTENING:
-        return _OnePeer(open_transport(url, signed=signed, allow_unsigned=allow_unsigned))
+        single = open_transport(
+            url, signed=signed, allow_unsigned=allow_unsigned, patient=False
+        )  # fmt: skip
+        return _OnePeer(single)
     opened = endpoint.open_socket(beyond=signed or allow_unsigned)
     if endpoint.scheme == "udpin":
         return _UdpListener(opened, url, admits)
@@ -219,6 +228,30 @@ def _text_of(address: Any) -> str:
 # Streams ------------------------------------------------------------------------------------------
 
 
+class _Backlog:
+    """Batches that wait for a slow reader: up to `most` bytes, of which the oldest go first.
+
+    Args:
+        push: Sends as many bytes as the reader accepts, and returns the rest.
+    """
+
+    def __init__(self, push: Callable[[bytes], bytes], most: int) -> None:
+        self._push, self._most = push, most
+        self._begun = b""  # rest of a partly sent batch
+        self._waiting: deque[bytes] = deque()
+
+    def send(self, data: bytes) -> None:
+        """Send a batch, and those that wait, as far as the reader accepts them."""
+        if data:
+            self._waiting.append(data)
+        while self._begun or self._waiting:
+            self._begun = self._push(self._begun or self._waiting.popleft())
+            if self._begun:
+                break
+        while sum(map(len, self._waiting)) > self._most:
+            self._waiting.popleft()
+
+
 class _Stream(_SocketOwner, Transport):
     """A connected stream socket with one peer.
 
@@ -237,26 +270,16 @@ class _Stream(_SocketOwner, Transport):
     ) -> None:
         super().__init__(connection, url)
         self.address = address
-        self._patient = patient
         self._chunk = _CHUNK if patient else _SMALL_CHUNK
-        self._buffer = buffer
-        self._begun = b""  # rest of a partly sent batch
-        self._waiting: deque[bytes] = deque()
+        self._backlog = None if patient else _Backlog(self._push, buffer)
 
     def send(self, data: bytes) -> None:
-        if self._patient:
-            while data := self._push(data):
-                if not self._await(select.POLLOUT, _SEND_TIMEOUT_S):
-                    self._lost(f"the peer read nothing for {_SEND_TIMEOUT_S:g} s")
+        if self._backlog is not None:
+            self._backlog.send(data)
             return
-        if data:
-            self._waiting.append(data)
-        while self._begun or self._waiting:
-            self._begun = self._push(self._begun or self._waiting.popleft())
-            if self._begun:
-                break
-        while sum(map(len, self._waiting)) > self._buffer:
-            self._waiting.popleft()
+        while data := self._push(data):
+            if not self._await(select.POLLOUT, _SEND_TIMEOUT_S):
+                self._lost(f"the peer read nothing for {_SEND_TIMEOUT_S:g} s")
 
     def _push(self, data: bytes) -> bytes:
         """Send as many bytes as the socket accepts, and return the rest."""
@@ -358,7 +381,7 @@ class _FirstClient(Transport):
 class _SerialPort(Transport):
     """A serial line to one peer, 8N1 without flow control."""
 
-    def __init__(self, endpoint: Endpoint) -> None:
+    def __init__(self, endpoint: Endpoint, *, patient: bool = True) -> None:
         import serial
 
         self.url = endpoint.url
@@ -370,11 +393,23 @@ class _SerialPort(Transport):
             )  # fmt: skip
         except (*self._failures, ValueError) as error:
             raise LinkError(f"{endpoint.url}: {_serial_reason(error, endpoint.device)}") from None
+        self._backlog = None if patient else _Backlog(self._push, _BACKLOG)
 
     def send(self, data: bytes) -> None:
+        if self._backlog is not None:
+            self._backlog.send(data)
+            return
         try:
             self._port.write(data)
         except self._failures as error:
+            self._lost(f"the serial device failed: {error}")
+
+    def _push(self, data: bytes) -> bytes:
+        try:
+            return data[os.write(self._port.fileno(), data) :]
+        except BlockingIOError:
+            return data
+        except OSError as error:
             self._lost(f"the serial device failed: {error}")
 
     def _pull(self) -> bytes:
@@ -635,10 +670,10 @@ def signing_from_file(path: str | Path | None) -> Signing | None:
     if path is None:
         return None
     try:
-        passphrase = Path(path).read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        problem = getattr(error, "strerror", None) or str(error)
-        raise ConfigError(f"cannot read the passphrase: {problem}", path=Path(path)) from None
+        # The user named it, so a link is followed, but a device or a pipe is not read.
+        passphrase = read_bounded(Path(path).resolve(), _LONGEST_KEY).decode().strip()
+    except (RecordError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot read the passphrase: {error}", path=Path(path)) from None
     if not passphrase:
         raise ConfigError("must contain a passphrase, but is empty", path=Path(path))
     return Signing(key_from_passphrase(passphrase), clock=time.time)

@@ -216,6 +216,7 @@ class CompanionInjection(CompanionFault, SourceInjection):
 
     def tick(self, moment: Moment) -> None:
         """Strike a process if the fault is due, and end a slowdown when its time is up."""
+        self.injector.watch(moment)
         self.injector.strike(moment)
         if moment.stamp_s >= self._until_s:
             self.close()

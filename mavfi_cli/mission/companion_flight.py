@@ -322,7 +322,7 @@ class CompanionFlight:
         if self._gate is None and (text := self._commanders.another(message)):
             self.logger.note(self.stamp_s, "program", text, self.telemetry.state)
         if message.get_msgId() == _SETPOINT and self.telemetry.state is not None:
-            self._command = command_of(message, self.telemetry.state)
+            self._command = command_of(message, self.telemetry)
 
     # The end --------------------------------------------------------------------------------------
 
@@ -474,7 +474,8 @@ class LockstepFlight(CompanionFlight):
             self._awaited_ms, self._since_s = None, time.monotonic()
             if not reaches:  # a fault or the gate has changed it
                 frames.append(self._release())
-        return frames
+        # In one piece, because the vehicle goes on after the read that contains the answer.
+        return [b"".join(frames)] if frames else ()
 
     def _is_tick(self, message: Message) -> bool:
         return message.get_msgId() == _POSITION and self.telemetry.is_from(message, AUTOPILOT)

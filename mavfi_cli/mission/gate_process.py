@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import select
 import signal
@@ -19,8 +20,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mavfi_cli.core.errors import MavfiError, described
-from mavfi_cli.core.files import open_own
-from mavfi_cli.core.processes import fork, interruptible
+from mavfi_cli.core.files import open_own, read_bounded
+from mavfi_cli.core.processes import EndWatch, fork, interruptible
 from mavfi_cli.core.terminal import exit_code, note
 from mavfi_cli.core.types import StackMark
 from mavfi_cli.link.codec import Codec, Message, dialect, frame_of, text_messages
@@ -34,6 +35,7 @@ from mavfi_cli.spec.detector import DetectorConfig
 _TURN_S = 0.1
 _HANG_S = 1.0  # silence of the worker after which it is killed
 _FAILED = 70  # exit code of a worker that an unexpected error ended
+_REMIND_S = 5.0  # interval between texts that the gate has failed
 _LOOK_S = 0.5  # interval between checks of the companion's process
 
 
@@ -77,7 +79,9 @@ class GateProcess:
             signing=signing_from_file(self.key_file),
         )  # fmt: skip
         worker = _Worker(self, router, passing, log)
-        note(f"the gate is ready: {self.detector.name}, companion on port {router.port}")
+        worker.make_gate()
+        port = f"port {router.port}" if router.port else self.companion
+        note(f"the gate is ready: {self.detector.name}, companion on {port}")
         judges = True
         with interruptible() as interrupts:
             while True:
@@ -107,6 +111,14 @@ class _Worker:
     ) -> None:
         self._process, self._router, self._passing, self._log = process, router, passing, log
 
+    def make_gate(self) -> None:
+        """Make the gate in this process, because a worker must soon give a sign of life."""
+        process = self._process
+        self._gate = SetpointGate(
+            process.detector, process.settings, process.mark, note=self.tell,
+            signing=signing_from_file(process.key_file), gone=_Watch(process.process).gone,
+        )  # fmt: skip
+
     def tell(self, text: str) -> None:
         """Print an event, and append it to the log."""
         line = {"unix_s": round(time.time(), 3), "event": text}
@@ -129,27 +141,23 @@ class _Worker:
             return _FAILED
 
     def _route(self, alive: int, *, judges: bool) -> None:
-        process, gate = self._process, None
+        gate = self._gate
         if judges:
-            gate = SetpointGate(
-                process.detector, process.settings, process.mark, note=self.tell,
-                signing=signing_from_file(process.key_file), gone=_Watch(process.process).gone,
-            )  # fmt: skip
-            judge = gate
-            self._passing.rule = lambda message, side: judge.pass_between(
+            self._passing.rule = lambda message, side: gate.pass_between(
                 message, side, time.monotonic()
             )
-        elif process.settings.on_error == "closed":
+        elif self._process.settings.on_error == "closed":
             self._passing.rule = _closed
-        if not judges:
-            self._announce()
+        announced_s = -math.inf
         while True:
             self._router.turn(_TURN_S, time.monotonic() + _TURN_S)
             os.write(alive, b".")
-            if gate is not None and gate.outbox:
-                for frame in gate.outbox:
-                    self._router.send(frame, Side.COMPANION)
-                gate.outbox.clear()
+            if not judges and time.monotonic() - announced_s > _REMIND_S:
+                self._announce()  # again and again, because peers connect later
+                announced_s = time.monotonic()
+            for frame in gate.outbox:
+                self._router.send(frame, Side.COMPANION)
+            gate.outbox.clear()
 
     def _announce(self) -> None:
         text = f"mavfi gate: failed {self._process.settings.on_error}".encode()
@@ -200,6 +208,7 @@ class _Watch:
     def __init__(self, process: str | None) -> None:
         self._process = process
         self._next_s, self._gone = 0.0, ""
+        self._number, self._watch = 0, None  # type: int, EndWatch | None
 
     def gone(self) -> str:
         """Return a message if the companion's process is gone, or an empty string if it is not.
@@ -211,10 +220,15 @@ class _Watch:
         self._next_s = time.monotonic() + _LOOK_S
         gone = f"the companion's process ({self._process}) is gone"
         try:
-            number = self._process if self._process.isdigit() else Path(self._process).read_text()
-            _, _, fields = Path(f"/proc/{int(number)}/stat").read_text().rpartition(")")
-            self._gone = gone if fields.split()[0] in ("Z", "X") else ""  # ended, not yet awaited
-        except (OSError, ValueError):
+            named = self._process.isdigit()
+            number = int(self._process if named else read_bounded(Path(self._process), 100))
+            if self._watch is not None and number != self._number:
+                self._watch.close()
+                self._watch = None
+            if self._watch is None:
+                self._watch, self._number = EndWatch(number), number
+            self._gone = gone if self._watch.look() else ""
+        except (MavfiError, OSError, ValueError):
             self._gone = gone
         return self._gone
 

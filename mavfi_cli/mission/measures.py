@@ -96,6 +96,7 @@ class FlightRecord:
         instruction_fault: The section `fault` if the fault is at instruction level.
         recorded_fault: The section `fault` as plain JSON values.
         in_lockstep: True for a flight of a user's companion in lockstep.
+        mark: Digest of the user's companion that flew, as in `StackMark`; old records have none.
         referee: None if the vehicle provided no truth.
         seeds: Seeds of the mission (`root`) and of its fault.
         files: SHA-256 of the user's files.
@@ -118,6 +119,7 @@ class FlightRecord:
     nodes: Mapping[str, NodeEnds] = field(default_factory=dict)
     programs: Mapping[str, ProgramEnds] = field(default_factory=dict)
     in_lockstep: bool = False
+    mark: str | None = None
     kernels: Mapping[str, KernelUse] = field(default_factory=dict)
     response_time_s: ResponseTime = field(default_factory=ResponseTime)
     measured_platform: MeasuredPlatform | None = None

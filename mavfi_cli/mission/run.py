@@ -186,7 +186,7 @@ def _fly_companion(
     result = _flown(config, flight, host, vehicle.truth, goal)
     guarded = {} if flight.detection is None else {"detection": flight.detection}
     ends = {name: asdict(program) for name, program in flight.programs.items()}
-    result |= {"pilot": {}, "plans": [], "programs": ends, **guarded}
+    result |= {"pilot": {}, "plans": [], "programs": ends, "mark": programs.mark.digest, **guarded}
     if deaths := {name: asdict(end) for name, end in injection.ends.items()}:
         result |= {"nodes": deaths}
     result |= {"in_lockstep": True} if programs.in_lockstep else {}

@@ -38,7 +38,7 @@ class _Counts:
     hold: int = 0  # the last accepted setpoint
     brake: int = 0  # a standstill
     autopilot: int = 0  # nothing: the autopilot was switched to hold, or notices the silence
-    stale: int = 0  # nothing: the companion is gone
+    stale: int = 0  # nothing, unless the gate only watches: the companion is gone
     none: int = 0  # the setpoint itself: the gate only watches
     alarms: list[dict[str, Any]] = field(default_factory=list)
 
@@ -90,6 +90,7 @@ class SetpointGate:
         self._steady: dict[tuple[int, int, int], tuple[tuple[str, ...], float]] = {}
         self._commanders = SetpointView.Commanders()
         self._failed = False
+        self._withheld = False  # what was last said of a setpoint
         self.outbox: list[bytes] = []
 
     @staticmethod
@@ -130,19 +131,18 @@ class SetpointGate:
         if text := self._commanders.another(message):
             self._say(text, math.inf)
         if why := self._staleness(message, now_s):
+            self._counts.stale += 1
             if self._settings.watch_only:
-                self._counts.none += 1
                 self._say(f"{why}: its setpoints pass", now_s)
                 return [message]
-            self._counts.stale += 1
             self._say(f"{why}: its setpoints are withheld", now_s)
             return []
         self._checks += 1
         sample = self._view.sample(message)
         alarm = self._gate.judge_tick(*sample)
         if alarm is None:
-            if self._in_a_row:
-                self._say("setpoints pass again", now_s)
+            if self._withheld and self._say("setpoints pass again", now_s):
+                self._withheld = False
             self._in_a_row, self._accepted, self._yaw_rad = 0, message, sample[2].yaw_rad
             return [message]
         self._in_a_row += 1
@@ -248,17 +248,22 @@ class SetpointGate:
         blamed = ", ".join(states[:2]) or "all inputs together"
         doing = "reported" if action == "none" else "withheld"
         self._say(f"setpoint {doing}: {blamed}: {alarm.detector} {alarm.score:.3g}", now_s)
+        self._withheld = action != "none"
 
-    def _say(self, text: str, now_s: float) -> None:
-        """Note an event, and send it as STATUSTEXT. Events within 1 s of the last are dropped."""
+    def _say(self, text: str, now_s: float) -> bool:
+        """Note an event, and send it as STATUSTEXT.
+
+        Return False, and do nothing, within 1 s of the last event.
+        """
         if now_s - self._noted_s < _TEXT_EVERY_S:
-            return
+            return False
         self._noted_s = now_s if math.isfinite(now_s) else self._noted_s
         self._note(text)
         self._codec.system = self._view.telemetry.system or 1
         data = f"mavfi gate: {text}".encode("ascii", "replace")
         for message in text_messages(dialect.MAV_SEVERITY_WARNING, data, self._checks % 65535 + 1):
             self.outbox.append(self._codec.encode(message))
+        return True
 
     def summary(self) -> dict[str, Any]:
         """Return the record of the gate's checks, alarms and responses, as plain JSON values."""
@@ -270,7 +275,7 @@ class SetpointGate:
             "protect": list(self._config.protect),
             "threshold": self._gate.detector.threshold,
             "checks": {"setpoint": self._checks},
-            "alarm_count": sum(responses.values()),
+            "alarm_count": sum(responses.values()) - counts.stale,
             "responses": responses,
             "alarms": counts.alarms,
             "recoveries": {},

@@ -7,8 +7,9 @@ that it requests within 1 s,
     d = (p_target - p) + v_target * 1 s + a_target / 2 * (1 s)^2,
 
 in ENU, with each term only if the setpoint has it. For a velocity setpoint d is thus its velocity
-times 1 s. For SET_ATTITUDE_TARGET d is (roll, pitch, thrust). The 2 inputs of the collision check
-are not used.
+times 1 s. For SET_ATTITUDE_TARGET d is (roll, pitch, thrust), or (roll rate, pitch rate, thrust)
+and a yaw rate in place of the yaw if the message gives body rates without an attitude. The 2 inputs
+of the collision check are not used.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 from mavfi_cli.core.types import Command, Trajectory, VehicleState
 from mavfi_cli.detect.offline import FlightSamples
 from mavfi_cli.link.codec import Message, dialect
-from mavfi_cli.link.telemetry import Telemetry
+from mavfi_cli.link.telemetry import ARDUCOPTER, AUTOPILOT, Telemetry
 from mavfi_cli.link.tlog import EPOCH_UNIX_S, tlog_messages
 
 _LOCAL = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
@@ -33,10 +34,12 @@ SETPOINTS = (_LOCAL, _GLOBAL, _ATTITUDE)
 
 _BODY = (dialect.MAV_FRAME_BODY_NED, dialect.MAV_FRAME_BODY_OFFSET_NED)
 _OFFSET = (*_BODY, dialect.MAV_FRAME_LOCAL_OFFSET_NED)
-_RELATIVE = (
+_RELATIVE = (  # the ground is level with home
     dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT, dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
+    dialect.MAV_FRAME_GLOBAL_TERRAIN_ALT, dialect.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT,
 )  # fmt: skip
-_NO_YAW, _NO_YAW_RATE = 0x400, 0x800  # bits of a setpoint's type_mask
+_NO_POSITION, _NO_YAW, _NO_YAW_RATE = 0x7, 0x400, 0x800  # bits of a setpoint's type_mask
+_NO_THRUST, _NO_ATTITUDE = 0x40, 0x80  # bits of the type_mask of SET_ATTITUDE_TARGET
 _DEGREE_M = 1e-7 * 111_319.5  # one unit of lat_int
 
 
@@ -75,7 +78,7 @@ class SetpointView:
         if not isinstance(message, dialect.MAVLink_unknown):
             self.telemetry.handle(message)
         if message.get_msgId() == dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT:
-            self._global = message
+            self._global = message if self.telemetry.is_from(message, AUTOPILOT) else self._global
 
     def sample(self, setpoint: Message) -> tuple[Trajectory | None, int, Command]:
         """Convert a setpoint to a detector sample: the arguments of `Gate.judge_tick`.
@@ -91,29 +94,33 @@ class SetpointView:
                 trajectory_seq=0, future_collision_seq=0,
             )  # fmt: skip
         self._state = state
-        return self._trajectory, 0, command_of(setpoint, state, self._global)
+        return self._trajectory, 0, command_of(setpoint, self.telemetry, self._global)
 
 
 def command_of(
-    setpoint: Message, state: VehicleState | None, global_position: Message | None = None
+    setpoint: Message, telemetry: Telemetry, global_position: Message | None = None
 ) -> Command:
     """Return a command with the yaw and the displacement within 1 s that a setpoint requests.
 
     The command holds the displacement as its velocity, in ENU. For SET_ATTITUDE_TARGET, it holds
-    (roll, pitch, thrust) there instead.
+    (roll, pitch, thrust) there instead, or body rates (see the module). In a body frame, ArduCopter
+    takes the yaw as relative and positions as offsets; PX4 takes the yaw as absolute and ignores
+    positions.
 
     Args:
-        state: Newest state of the vehicle.
+        telemetry: Newest telemetry of the autopilot, with the vehicle's state.
         global_position: The vehicle's newest GLOBAL_POSITION_INT, needed for setpoints with
             latitude and longitude.
     """
+    state, offsets = telemetry.state, telemetry.autopilot is ARDUCOPTER
     yaw_rad = 0.0 if state is None else state.yaw_rad
     stamp_s = 0.0 if state is None else state.stamp_s
     if setpoint.get_msgId() == _ATTITUDE:
-        roll, pitch, yaw = _euler(setpoint.q)
-        attitude = np.array([roll, pitch, setpoint.thrust])
+        roll, pitch, yaw, thrust = _attitude_of(setpoint)
+        attitude = np.array([roll, pitch, thrust])
         return Command(stamp_s=stamp_s, velocity_enu_mps=attitude, yaw_rad=yaw)
     mask, body = setpoint.type_mask, setpoint.coordinate_frame in _BODY
+    mask |= _NO_POSITION if body and not offsets else 0
     move = [0.0, 0.0, 0.0]  # north, east, down; in a body frame: forward, right, down
     targets = _position_errors(setpoint, state, global_position)
     velocity, pull = (
@@ -130,7 +137,7 @@ def command_of(
         cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
         forward, right = cosine * forward - sine * right, sine * forward + cosine * right
     if not mask & _NO_YAW:
-        new_rad = yaw_rad - setpoint.yaw if body else 0.5 * math.pi - setpoint.yaw
+        new_rad = (yaw_rad if body and offsets else 0.5 * math.pi) - setpoint.yaw
         yaw_rad = math.remainder(new_rad, math.tau) if math.isfinite(new_rad) else new_rad
     elif not mask & _NO_YAW_RATE:
         yaw_rad -= setpoint.yaw_rate
@@ -159,6 +166,27 @@ def _position_errors(
         return setpoint.x, setpoint.y, setpoint.z
     east_m, north_m, up_m = state.position_enu_m.tolist()
     return setpoint.x - north_m, setpoint.y - east_m, setpoint.z + up_m
+
+
+def _attitude_of(setpoint: Message) -> tuple[float, float, float, float]:
+    """Return the roll, pitch and yaw of a SET_ATTITUDE_TARGET in radians, and its thrust.
+
+    Without an attitude they are the body rates in rad/s. Fields that the mask ignores are 0. A yaw
+    rate beside an attitude adds what it turns in 1 s.
+    """
+    mask = setpoint.type_mask
+    rates = [
+        0.0 if mask & bit else rate
+        for bit, rate in (
+            (1, setpoint.body_roll_rate), (2, setpoint.body_pitch_rate),
+            (4, setpoint.body_yaw_rate),
+        )
+    ]  # fmt: skip
+    thrust = 0.0 if mask & _NO_THRUST else setpoint.thrust
+    if mask & _NO_ATTITUDE:
+        return rates[0], rates[1], rates[2], thrust
+    roll, pitch, yaw = _euler(setpoint.q)
+    return roll, pitch, yaw + rates[2], thrust
 
 
 def _euler(q: list[float]) -> tuple[float, float, float]:

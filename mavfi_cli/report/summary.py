@@ -182,8 +182,12 @@ def _detection_lines(detection: Detection | None, cost: DetectionCost | None) ->
             f"            at {alarm.stamp_s:.2f} s: {alarm.stage}, {where}: {alarm.response}"
         )
     if "setpoint" in detection.checks:  # the gate for a user's companion
-        counts = (f"{count} {name}" for name, count in responses.items() if count)
-        return [*lines, *(f"            setpoints withheld: {text}" for text in counts)]
+        doing = {"none": "setpoints reported: {}", "stale": "stale setpoints: {}"}
+        return lines + [
+            "            " + doing.get(name, f"setpoints withheld: {{}} {name}").format(count)
+            for name, count in responses.items()
+            if count
+        ]
     if alarms:
         recovered = [
             f"{stage} {recovery.count}x, {recovery.total_s * 1e3:.1f} ms"

@@ -208,7 +208,7 @@ class CompanionConfig:
             flight time of `success.golden` or, without it, the duration of a straight flight to the
             goal at the speed limit.
         key_file: File with the signing passphrase of the link, relative to this file. The vehicle
-            then signs its messages and accepts only signed ones, and a message that a fault changes,
+            then signs its messages and accepts only signed ones. A message that a fault changes,
             repeats or delays is signed again.
         gate: Behaviour of the gate with `--detector`.
         name: Name of the companion, which detector models that are fitted to it store; None for the

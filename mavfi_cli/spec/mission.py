@@ -277,6 +277,12 @@ class MissionConfig:
         return values
 
     @property
+    def paced_s(self) -> float:
+        """Longest wall-clock time of a flight that keeps pace with the wall clock, s; else 0."""
+        paced = self.companion is not None or self.realtime
+        return self.time_limit_s / self.speed if paced else 0.0
+
+    @property
     def golden(self) -> MissionConfig:
         """The golden mission: the same mission without a fault and without a detector."""
         return replace(self, **NOT_OF_GOLDEN)

@@ -130,7 +130,8 @@ def _mark_of(plan: TrainingPlan) -> StackMark:
     The models store this identity.
     """
     if plan.base.companion is not None:
-        return CompanionConfig.load(plan.base.companion, starts=not plan.logs).mark
+        flies = not plan.logs and plan.flown is None
+        return CompanionConfig.load(plan.base.companion, starts=flies).mark
     if plan.logs:
         return StackMark.of_companion("logs", "")
     return load_stack(plan.base.stack).mark

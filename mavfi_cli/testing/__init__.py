@@ -13,11 +13,6 @@ import pytest
 # Before the import, so that pytest explains failed assertions.
 pytest.register_assert_rewrite("mavfi_cli.testing.suites")
 
-from mavfi_cli.testing.suites import (  # noqa: E402
-    DetectorContract,
-    PlannerContract,
-    StreamTransportContract,
-    TransportContract,
-)
+from mavfi_cli.testing.suites import DetectorContract, PlannerContract  # noqa: E402
 
-__all__ = ["DetectorContract", "PlannerContract", "StreamTransportContract", "TransportContract"]
+__all__ = ["DetectorContract", "PlannerContract"]

@@ -8,7 +8,6 @@ import resource
 import socket
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import serial
@@ -188,16 +187,23 @@ def test_a_serial_device_without_permission(refused, monkeypatch):
 
 def test_a_key_file_without_permission(refused, tmp_path, monkeypatch):
     (tmp_path / "key").write_text("horse")
-    read_text = Path.read_text
+    open_ = os.open
 
     def deny(path, *args, **options):
-        if path.name == "key":
+        if os.path.basename(path) == "key":
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-        return read_text(path, *args, **options)
+        return open_(path, *args, **options)
 
-    monkeypatch.setattr(Path, "read_text", deny)
+    monkeypatch.setattr(os, "open", deny)
     line = refused(*LINK, "--key-file", "key")
     assert re.fullmatch("key: .*: Permission denied", line)
+
+
+@pytest.mark.parametrize("key", ["/dev/zero", "pipe"])
+def test_a_key_file_that_never_ends_is_refused(refused, tmp_path, key):
+    os.mkfifo(tmp_path / "pipe")
+    line = refused(*LINK, "--key-file", key)
+    assert line.endswith("is not a regular file")
 
 
 def test_a_camera_that_cannot_start_says_why(refused):

@@ -12,12 +12,11 @@ import tty
 from collections.abc import Callable, Iterator
 
 import pytest
+from transport_contract import WAIT_S, Pair, StreamTransportContract, TransportContract
 
 from mavfi_cli.core.errors import LinkError, LinkLost
 from mavfi_cli.link.codec import Codec, Signing, begins_with_frame, dialect, key_from_passphrase
 from mavfi_cli.link.transport import Transport, memory_pair, open_listener, open_transport
-from mavfi_cli.testing import StreamTransportContract, TransportContract
-from mavfi_cli.testing.suites import WAIT_S, Pair
 
 introduce, message = TransportContract.introduce, TransportContract.message
 receive, send = TransportContract.receive, TransportContract.send

@@ -13,7 +13,7 @@ import pytest
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.link.codec import Codec, Message, dialect
-from mavfi_cli.link.tlog import EPOCH_UNIX_S, RecordedLink, unix_time_of_stamp_0
+from mavfi_cli.link.tlog import EPOCH_UNIX_S, RecordedLink, tlog_messages, unix_time_of_stamp_0
 from mavfi_cli.link.transport import memory_pair
 
 MAVLOGDUMP = Path(pymavlink.__file__).parent / "tools" / "mavlogdump.py"
@@ -54,6 +54,20 @@ def _records(data: bytes) -> list[tuple[int, bytes]]:
         records.append((int.from_bytes(data[at : at + 8], "big"), frame))
         at += 8 + length
     return records
+
+
+@pytest.mark.parametrize("place", [8, 12 + 8 + 4])  # the marker, and a byte of the payload
+def test_reading_ends_at_the_first_damaged_record(tmp_path: Path, place: int) -> None:
+    path = tmp_path / "flight.tlog"
+    _write(path, 3)
+    records = _records(path.read_bytes())
+    start = sum(8 + len(frame) for _, frame in records[:2])
+    data = bytearray(path.read_bytes())
+    data[start + place] ^= 0x55
+    path.write_bytes(data)
+    assert [m.get_type() for _, m in tlog_messages(path)] == [
+        "LOCAL_POSITION_NED", "SET_POSITION_TARGET_LOCAL_NED",
+    ]  # fmt: skip
 
 
 def test_mavlogdump_reads_both_directions(tmp_path: Path) -> None:

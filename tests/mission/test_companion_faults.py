@@ -209,6 +209,15 @@ def test_the_hint_knows_the_reason_of_a_random_time_after_the_flight(tmp_path):
     assert fault.injector.missed.startswith(_TOO_SHORT)
 
 
+def test_a_phase_without_the_message_is_not_missed(tmp_path):
+    fault = CompanionInjection(FaultConfig(target=SETPOINT, effect="drop", at="phase=AUTO.TAKEOFF"))
+    fault.aim_at(1.0)
+    fault.begin(tmp_path / "fault.json")
+    fault.tick(at(0.0)._replace(phase="AUTO.TAKEOFF"))
+    assert f"no {SETPOINT} came after phase" in fault.injector.missed
+    assert passed(fault.link, [setpoint()]) == []
+
+
 def test_a_program_that_does_not_run_is_not_struck(tmp_path):
     fault = CompanionInjection(FaultConfig(target="process.hop", at="time=0"))
     fault.aim_at(1.0)
@@ -226,6 +235,15 @@ def test_a_frozen_field_stays_and_an_ignored_one_is_not_read():
     (struck,) = passed(ignored, [setpoint()])
     ignored.deliver(struck, Side.COMPANION, 0.0)
     assert ignored.follower.activation.value == "not_read"
+    rates = dialect.MAVLink_set_attitude_target_message(
+        0, 1, 1, 128, [1.0, 0.0, 0.0, 0.0], 0.3, 0.0, 0.0, 0.5
+    )
+    (rates,) = Codec(0, 0).decode(Codec(1, 191).encode(rates))
+    for field, activation in (("q[0]", "not_read"), ("body_roll_rate", "read")):
+        link = injector(f"SET_ATTITUDE_TARGET.{field}")
+        (struck,) = passed(link, [rates])
+        link.deliver(struck, Side.COMPANION, 0.0)
+        assert link.follower.activation.value == activation
 
 
 def test_direction_and_components():

@@ -14,12 +14,13 @@ import pytest
 from made_flights import companion_gate
 
 from mavfi_cli import library
+from mavfi_cli.analysis.scores import flown_samples
 from mavfi_cli.campaigns import run as runner
 from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.core.errors import ConfigError, MavfiError, RecordError
+from mavfi_cli.core.errors import ConfigError, MavfiError, ModelError, RecordError
 from mavfi_cli.core.flight_record import ProgramEnds
 from mavfi_cli.link.codec import Codec
 from mavfi_cli.mission.crew import Crew
@@ -82,6 +83,19 @@ def test_a_flight_leaves_a_record_as_any_other(fly):
     assert ViewedFlight(name="flight", run=run, recorder=None).run is run
     with pytest.raises(RecordError, match="is not repeatable"):
         fly_again(run, run.folder.path.parent)
+
+
+@pytest.mark.slow
+def test_a_detector_is_not_fitted_to_flights_of_other_commands(fly, tmp_path):
+    run = fly("lands")
+    mark = CompanionConfig.load(run.record.config["companion"]).mark
+    flights, left_out, _ = flown_samples(tmp_path / "runs", mark)
+    assert (len(flights), left_out) == (1, 0)
+    file = tmp_path / "hop.toml"
+    file.write_text(file.read_text().replace("lands", "leaves"))
+    assert len(flown_samples(tmp_path / "runs", mark)[0]) == 1
+    with pytest.raises(ModelError, match="none of the 1 runs"):
+        flown_samples(tmp_path / "runs", CompanionConfig.load(str(file)).mark)
 
 
 @pytest.mark.slow

@@ -107,6 +107,8 @@ def test_a_companion_that_ends_or_is_silent_never_hangs_the_flight(
     [
         ("process.client", "flip"),
         (SETPOINT, "drop"),
+        (SETPOINT, "swap"),
+        (SETPOINT, "twice"),
         (f"{SETPOINT}.time_boot_ms", "flip"),
         ("LOCAL_POSITION_NED", "drop"),
         ("LOCAL_POSITION_NED", "late=0.1"),

@@ -27,6 +27,7 @@ from mavfi_cli.detect.offline import Dataset, FlightSamples
 from mavfi_cli.detect.preprocess import PreprocessParams, span
 from mavfi_cli.link.codec import Codec, Signing, dialect, frame_of, key_from_passphrase
 from mavfi_cli.link.router import Side
+from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.tlog import TlogWriter
 from mavfi_cli.mission import gate_process
 from mavfi_cli.mission.gate_process import require_process
@@ -220,7 +221,17 @@ def test_watching_only_reports(gate):
     assert "reported" in own.said[0]
     gone = gate(watch_only=True, gone=lambda: "the program script is gone")
     assert velocities(gone, [2.0] * 12) == [[2.0]] * 12
-    assert gone.summary()["responses"]["stale"] == 0
+    summary = gone.summary()
+    assert (summary["responses"]["stale"], summary["alarm_count"]) == (3, 0)
+
+
+def test_setpoints_that_pass_again_are_told_even_after_a_short_alarm(gate):
+    own = gate()
+    assert velocities(own, [-1000.0, 2.0, 2.0]) == [[2.0]] * 3
+    assert own.said[-1].startswith("setpoint withheld")
+    own.pass_between(setpoint(), Side.COMPANION, 9.0)
+    own.pass_between(setpoint(), Side.COMPANION, 19.0)
+    assert own.said[1:] == ["setpoints pass again"]
 
 
 def test_setpoints_of_a_companion_that_is_gone_end_once_they_no_longer_change(gate):
@@ -298,7 +309,43 @@ def test_setpoints_of_every_kind_are_read_in_the_world_frame():
         0, 1, 1, 0, [math.cos(0.1), math.sin(0.1), 0, 0], 0, 0, 0, 0.5
     )
     assert read(received(attitude)) == [0.2, 0.0, 0.5, 0.0]
-    assert math.isnan(command_of(setpoint(math.nan), None).velocity_enu_mps[1])
+    rates = dialect.MAVLink_set_attitude_target_message(
+        0, 1, 1, 128, [math.nan] * 4, 0.3, -0.2, 0.1, 0.5
+    )
+    assert read(received(rates)) == [0.3, -0.2, 0.5, 0.1]
+    assert math.isnan(command_of(setpoint(math.nan), Telemetry()).velocity_enu_mps[1])
+
+
+def test_altitudes_above_the_ground_and_positions_of_other_senders():
+    view = SetpointView()
+    for message in states(1000):
+        view.hear(message)
+    for component, altitude_mm in ((1, 500000), (100, 0)):
+        here = dialect.MAVLink_global_position_int_message(
+            1000, 470000000, 80000000, altitude_mm, 5000, 0, 0, 0, 0
+        )
+        view.hear(received(here, component=component))
+    for frame, up_m in ((11, 2.0), (6, 2.0), (5, 7.0 - 500.0)):
+        place = dialect.MAVLink_set_position_target_global_int_message(
+            0, 1, 1, frame, 0b1101_1111_1000, 470000000, 80000000, 7.0, *[0.0] * 8
+        )
+        assert view.sample(received(place))[2].velocity_enu_mps[2] == pytest.approx(up_m)
+
+
+@pytest.mark.parametrize(("autopilot", "turned", "moved"), [(12, True, 0.0), (3, False, 5.0)])
+def test_a_body_frame_is_read_as_the_autopilot_reads_it(autopilot, turned, moved):
+    """PX4 takes the yaw as absolute and ignores positions; ArduCopter takes both as offsets."""
+    heartbeat = dialect.MAVLink_heartbeat_message(2, autopilot, 129, 0, 4, 3)
+    attitude = dialect.MAVLink_attitude_message(1000, 0, 0, 1.0, 0, 0, 0)
+    view = SetpointView()
+    for message in (heartbeat, attitude):
+        view.hear(received(message, component=1))
+    for message in states(1000)[2:]:
+        view.hear(message)
+    command = view.sample(setpoint(0.0, mask=0b1001_1100_0000, frame=8, x=5.0, yaw=0.25))[2]
+    yaw_rad = 0.5 * math.pi - (0.25 if turned else 1.25)
+    assert command.yaw_rad == pytest.approx(yaw_rad)
+    assert np.linalg.norm(command.velocity_enu_mps) == pytest.approx(moved)
 
 
 def test_a_tlog_gives_the_samples_of_its_setpoints(tmp_path):
@@ -324,6 +371,24 @@ def test_a_process_is_gone_before_its_parent_has_awaited_it():
             require_process(str(process.pid))
     finally:
         process.wait()
+
+
+def test_a_process_that_has_ended_stays_gone_although_its_id_is_used_again(tmp_path, monkeypatch):
+    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    monkeypatch.setattr(gate_process, "_LOOK_S", 0.0)
+    path = tmp_path / "script.pid"
+    path.write_text(f"{process.pid}\n")
+    watch = gate_process._Watch(str(path))
+    assert watch.gone() == ""
+    process.stdin.close()
+    process.wait()
+    assert "is gone" in watch.gone()
+    monkeypatch.setattr(gate_process, "EndWatch", lambda pid: pytest.fail("looked up again"))
+    assert "is gone" in watch.gone()
+    monkeypatch.undo()
+    path.write_text(f"{os.getpid()}\n")
+    watch._next_s = 0.0
+    assert watch.gone() == ""
 
 
 def test_an_unexpected_error_ends_the_worker_and_not_the_gate(monkeypatch):
@@ -371,13 +436,16 @@ def test_the_gate_passes_frames_byte_for_byte_and_fails_as_configured(model, fai
     with running(model, "--fail", fails, "--log", str(log)) as (process, autopilot, companion):
         heartbeat = frame_of(received(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 0, 3)))
         good, wild = (frame_of(setpoint(vx)) for vx in (2.0, -1000.0))
+        texts = []
 
         def passed():
             """Return the next frame that is none of the gate's own texts."""
             while True:
                 data, _ = autopilot.recvfrom(1000)
-                if Codec(0, 0).decode(data)[0].get_type() != "STATUSTEXT":
+                (message,) = Codec(0, 0).decode(data)
+                if message.get_type() != "STATUSTEXT":
                     return data
+                texts.append(message.text)
 
         def through(frame):
             companion.send(frame)
@@ -399,6 +467,7 @@ def test_the_gate_passes_frames_byte_for_byte_and_fails_as_configured(model, fai
         while data == heartbeat and fails == "open":
             data = passed()
         assert data == (wild if fails == "open" else heartbeat)
+        assert f"mavfi gate: failed {fails}" in "".join(texts)
     assert f"has failed {fails}" in log.read_text()
 
 
