@@ -56,7 +56,7 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
         lines = summary_lines(recorded.record)
         if golden is not None:
             lines += difference_lines(recorded, golden)
-        elif recorded.record.fault:
+        elif recorded.record.fault and recorded.record.config.get("companion") is None:
             lines.append("Effect      unknown; `mavfi show --pair` flies the golden run to find it")
         if events:
             lines += ["", "Events", *event_lines(recorded.record)]

@@ -92,7 +92,8 @@ def _again(run: Run) -> Recorder | None:
         note(f"flying again: {config.world}, seed {config.seed}")
         recorder, same = watch_again(run)
     except RecordError as error:
-        note(f"no depth frames, clouds and maps: {error}; `mavfi fly --record` keeps them")
+        remedy = "" if run.record.config.get("companion") else "; `mavfi fly --record` keeps them"
+        note(f"no depth frames, clouds and maps: {error}{remedy}")
         return None
     if not same:
         note(f"warning: {run.folder.path}: the repetition differs: depth frames, clouds and maps "

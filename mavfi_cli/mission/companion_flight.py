@@ -90,6 +90,7 @@ class CompanionFlight:
         self.reason = ""
         self.programs: dict[str, ProgramEnds] = {}
         self._heard_s = time.monotonic()
+        self._spoken = False  # a program has sent a message
         self._command: Command | None = None
         self._gate = self._planned_gate()
         self._commanders = SetpointView.Commanders()
@@ -212,6 +213,8 @@ class CompanionFlight:
     def _pass(self, message: Message, side: Side) -> Iterable[bytes]:
         if side is Side.AUTOPILOT:
             self._hear(message)
+        else:
+            self._spoken = True
         link = self.injection.link
         passed = [message] if link is None else link.pass_between(message, side, self._moment)
         return [frame for own in passed for frame in self._deliver(own, side)]
@@ -358,7 +361,8 @@ class CompanionFlight:
             else:
                 self._end(Outcome.TIMEOUT, "the companion ended its flight without success")
         elif flown_s >= self._time_limit_s:
-            late = "" if armed_once else "the companion never armed the vehicle"
+            never = "armed the vehicle" if self._spoken else "sent a MAVLink message"
+            late = "" if armed_once else f"the companion never {never}"
             self._end(Outcome.TIMEOUT, failure or late)
         elif time.monotonic() - self._heard_s > _SILENCE_S:
             self._end(Outcome.LINK_LOST, f"the vehicle sent nothing for {_SILENCE_S:g} s")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import math
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -127,7 +128,7 @@ class _ListedMission:
 
     Attributes:
         ratio: flight time divided by that of the golden flight; None if the mission is lost.
-        command: command that repeats the flight.
+        command: command that repeats the flight; empty for a flight of a user's companion.
         picture: its top view as a data URL; empty if the page does not show it.
     """
 
@@ -478,6 +479,7 @@ def _listed(
     path = source.path
     place = path.name if path.suffix and path.is_absolute() else str(path)
     run = [flight["path"]] if kept else [place, "--mission", str(flight["number"])]
+    repeats = "companion" not in json.loads(flight["changes"])
     return _ListedMission(
         number=flight["number"],
         fault=" + ".join(filter(None, (fault, flight["detector"]))),
@@ -485,7 +487,7 @@ def _listed(
         seed=flight["seed"],
         outcome=flight["outcome"],
         ratio=flight["over_own"],
-        command=shlex.join(["mavfi", "replay", *run]),
+        command=shlex.join(["mavfi", "replay", *run]) if repeats else "",
         picture=_flight_picture(Path(flight["path"])) if kept and pictured else "",
     )
 

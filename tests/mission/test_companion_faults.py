@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from mavfi_cli import library
 from mavfi_cli.cli.fly import _TOO_SHORT
-from mavfi_cli.core.errors import FaultSpecError, MavfiError, UnknownName
+from mavfi_cli.core.errors import FaultSpecError, MavfiError, TracingForbidden, UnknownName
 from mavfi_cli.fi.injector import Moment
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.link import codec, fields
@@ -393,22 +393,18 @@ def test_a_static_program_is_struck_in_flight(tmp_path, native_program):
     assert fault.symbol.split("+")[0] in ("main", "body")
 
 
-@pytest.mark.slow
-def test_without_permission_to_trace_a_flight_tells_the_remedy(tmp_path, monkeypatch):
+def test_without_permission_to_trace_nothing_flies_and_the_remedy_is_told(tmp_path, monkeypatch):
     def refused(*_arguments):
         raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
 
     monkeypatch.setattr(linux, "request", refused)
     companion = hop_file(tmp_path, 4)
-    run = library.fly(
-        companion=str(companion), world="farm", speed=4.0, time_limit_s=60.0, out=tmp_path,
-        instruction=InstructionConfig(target="hop", at="time=4"),
-    )  # fmt: skip
-    assert run.record.outcome == "success"
-    fault = run.record.instruction_fault
-    assert fault.state == "not_injected"
-    assert "Operation not permitted" in fault.reason
-    assert "ptrace" in fault.reason
+    with pytest.raises(TracingForbidden, match=r"Operation not permitted(.|\n)*ptrace"):
+        library.fly(
+            companion=str(companion), world="farm", speed=4.0, out=tmp_path / "runs",
+            instruction=InstructionConfig(target="hop", at="time=4"),
+        )  # fmt: skip
+    assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.parametrize(

@@ -113,7 +113,7 @@ def test_the_heartbeat_of_the_camera(fly, beats):
     [
         ("crashes", {}, "collision", "ground"),
         ("dies", {"limit_s": 30.0}, "crash", "killed by SIGKILL"),
-        ("waits", {"limit_s": 3.0}, "timeout", "never armed"),
+        ("waits", {"limit_s": 3.0}, "timeout", "never sent a MAVLink message"),
         ("hangs", {}, "failsafe", "a failsafe of the autopilot landed the vehicle"),
         ("waits", {"program": "ready_port = 1\nready_limit_s = 0.5"}, "crash",
          "hop was not ready within 0.5 s"),
@@ -134,6 +134,7 @@ def test_a_vehicle_with_a_key_obeys_only_a_companion_that_signs(fly, tmp_path, s
     record = fly("lands", top="key_file = 'key'", program=key, fault=fault, limit_s=30.0).record
     assert record.outcome == ("success" if signs else "timeout")
     assert record.fault.state == ("applied" if signs else "not_injected")
+    assert record.reason == ("landed" if signs else "the companion never armed the vehicle")
 
 
 @pytest.mark.slow

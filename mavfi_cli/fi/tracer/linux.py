@@ -20,6 +20,7 @@ from pathlib import Path
 from types import TracebackType
 
 from mavfi_cli.core.errors import TracingForbidden
+from mavfi_cli.core.processes import fork
 
 PEEKUSER, POKEUSER = 3, 6
 CONT, SINGLESTEP, DETACH, SYSCALL = 7, 9, 17, 24
@@ -97,6 +98,25 @@ def seize(tid: int, *, kill_with_tracer: bool) -> None:
         request(SEIZE, tid, 0, options)
     except PermissionError as error:
         raise TracingForbidden("tracing a process", str(error), _REMEDY) from None
+
+
+def require_permission() -> None:
+    """Trace a process for a moment.
+
+    Raises:
+        TracingForbidden: The operating system refuses; the message explains how to allow it.
+    """
+    child = fork(_wait_to_be_killed)
+    try:
+        seize(child, kill_with_tracer=True)
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+
+
+def _wait_to_be_killed() -> int:
+    signal.pause()
+    return 0
 
 
 def get_registers(tid: int, note: int, buffer: ctypes.Array[ctypes.c_char]) -> int:

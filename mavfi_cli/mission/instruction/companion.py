@@ -17,7 +17,7 @@ from mavfi_cli.core.flight_record import NodeCrash, NodeEnds, Strike
 from mavfi_cli.core.processes import Ended, EndWatch
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.injector import Moment
-from mavfi_cli.fi.tracer import record, stepper
+from mavfi_cli.fi.tracer import linux, record, stepper
 from mavfi_cli.fi.tracer.inject import NOTHING
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.mission.companion_faults import CompanionFault
@@ -40,10 +40,14 @@ class ProcessInjection(CompanionFault):
     Args:
         request: A fault that `check_companion_fault` accepts.
         repeat: Record of a fault whose instruction is to be struck again; None to draw one.
+
+    Raises:
+        TracingForbidden: The operating system does not permit tracing.
     """
 
     def __init__(self, request: InstructionConfig, repeat: FaultRecord | None) -> None:
         super().__init__()
+        linux.require_permission()
         self._request, self._strategy, self._repeat = request, mission_strategy(request), repeat
         self._path: Path | None = None
         self._tracer: TracerThread[LiveAttack] | None = None
