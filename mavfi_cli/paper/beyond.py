@@ -320,7 +320,8 @@ class RestartComparison:
     """Success of a stack in a world on the same faults, with different restart delays.
 
     Attributes:
-        place: the stack, with the kind of its worlds if the missions have both kinds.
+        place: the stack, the injector that is copied, if any, and the kind of its worlds if the
+            missions have both kinds.
         paper: success rates in Table IV, in per cent, for golden flights and for flights with a
             fault; None if the table lacks the world.
         golden: share of golden flights that succeed.
@@ -346,7 +347,8 @@ class RestartComparison:
 def restarts(flights: Flights) -> list[RestartComparison]:
     """Compare restart rules on the same instruction-level faults, for each stack and world.
 
-    Fixed worlds are compared apart from other worlds.
+    Only missions count whose golden flight succeeds. Fixed worlds are compared apart from other
+    worlds, and a copied injector apart from mavfi's own.
     """
     kinds = flights.by_worlds
     if len(kinds) < 2:
@@ -359,12 +361,16 @@ def restarts(flights: Flights) -> list[RestartComparison]:
 
 
 def _of_kind(flights: Flights) -> Iterator[RestartComparison]:
-    hit = flights.struck(level="instruction").shared("stack", "world", arm="restart_s")
-    by_place = {place: mine.by("restart_s") for place, mine in hit.by("stack", "world").items()}
-    for stack in sorted({stack for stack, _ in by_place}):
+    hit = flights.struck(level="instruction", own_lost=False)
+    hit = hit.shared("stack", "world", arm="restart_s")
+    injectors = (json.loads(fault)[1].get("compat") or "" for fault in hit["fault"])
+    places = zip(hit["stack"], injectors, hit["world"], strict=True)
+    by_place = {place: mine.by("restart_s") for place, mine in hit.grouped(places).items()}
+    for stack, injector in sorted({(stack, injector) for stack, injector, _ in by_place}):
         for world in hit.worlds:
-            if len(by_place.get((stack, world), ())) > 1:
-                yield _restarts(stack, world, by_place[stack, world], flights.golden)
+            if len(rules := by_place.get((stack, injector, world), {})) > 1:
+                row = _restarts(stack, world, rules, flights.golden)
+                yield replace(row, place=f"{stack}, {injector}") if injector else row
 
 
 def _restarts(

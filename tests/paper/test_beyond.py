@@ -153,6 +153,18 @@ def test_restart_rules_are_compared_on_the_faults_that_all_of_them_flew():
     assert found.p_value == 0.5
 
 
+def test_restart_rules_are_compared_by_injector_and_without_lost_golden_flights():
+    rows = [row(seed=1), row(seed=2, **LOST)]
+    for seed, compat in ((1, {}), (1, {"compat": "rosfi-2021"}), (2, {})):
+        for restart_s in (1.0, 3600.0):
+            lost = LOST if compat or seed == 2 else {}
+            rows.append(under(restart_s, seed, fault=compat, **lost))
+    own, released = restarts(flights(rows))
+    assert (own.place, released.place) == ("mavbench", "mavbench, rosfi-2021")
+    assert [each.counts for each in own.success.values()] == ["1 of 1", "1 of 1"]
+    assert [each.counts for each in released.success.values()] == ["0 of 1", "0 of 1"]
+
+
 def test_restart_rules_in_fixed_worlds_are_compared_apart_from_those_in_others():
     rows = []
     for config in ({}, {"world_seed": 4}):
