@@ -471,6 +471,25 @@ def test_the_gate_passes_frames_byte_for_byte_and_fails_as_configured(model, fai
     assert f"has failed {fails}" in log.read_text()
 
 
+def test_the_gate_runs_on_a_board_without_the_packages_of_the_simulation(model):
+    absent = ("jsbsim", "ompl", "fcl", "octomap", "pyarrow", "matplotlib", "capstone", "elftools",
+              "rich", "scipy", "torch")  # fmt: skip
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({absent!r}))\n"
+        "from mavfi_cli.cli import main\nmain()"
+    )
+    arguments = ["gate", "--autopilot", "udpout:127.0.0.1:9", "--to", "udpin:127.0.0.1:0",
+                 "--detector", "range", "--model", str(model)]  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert "the gate is ready" in process.stderr.readline()
+    finally:
+        process.terminate()
+        process.communicate()
+
+
 def test_a_companions_file_has_the_defaults_of_the_gate(tmp_path, monkeypatch):
     run = []
     monkeypatch.setattr(gate_process.GateProcess, "run", lambda gate: run.append(gate) or 0)
