@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
@@ -231,10 +233,17 @@ class CompanionInjection(CompanionFault, SourceInjection):
 
     @property
     def _target(self) -> RunningProgram | None:
-        return self.running.get(self._config.killed_node or "")
+        return self.running.get((self._config.killed_node or "").partition("/")[0])
+
+    @property
+    def _struck_pid(self) -> int | None:
+        """Id of the process that the fault strikes; None while it does not run."""
+        executable = (self._config.killed_node or "").partition("/")[2] or None
+        running = self._target is not None and self._target.poll()
+        return self._target.process(executable) if running and self._target is not None else None
 
     def _target_runs(self) -> bool:
-        return self._target is not None and self._target.poll() and self._target.pid is not None
+        return self._struck_pid is not None
 
     def _on_strike(self, strike: Strike) -> None:
         """Record the first strike before it takes effect, then kill or slow a targeted process."""
@@ -249,7 +258,9 @@ class CompanionInjection(CompanionFault, SourceInjection):
         program, corruption = self._target, self._config.corruption()
         assert program is not None
         if corruption.effect is Effect.FLIP:
-            program.signal(signal.SIGKILL)
+            if (pid := self._struck_pid) is not None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
             return
         if program.throttle is None:
             self._throttle = Throttle(program, corruption.amount)

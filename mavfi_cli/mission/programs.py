@@ -144,6 +144,30 @@ class RunningProgram:
             return False
         return True
 
+    def process(self, executable: str | None) -> int | None:
+        """Return the id of the first process of the program that runs a given executable.
+
+        Return None if no such process exists.
+
+        Args:
+            executable: File name of the executable, or of the script that an interpreter runs. If
+                None, the id of the program's own process is returned, which leads the session.
+        """
+        self.poll()
+        if self.pid is None or executable is None:
+            return self.pid
+        for pid in sorted(int(name) for name in os.listdir("/proc") if name.isdigit()):
+            with contextlib.suppress(OSError):  # it has ended, or is another user's
+                if os.getsid(pid) != self.pid:
+                    continue
+                line = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+                name, *words = map(os.fsdecode, line)
+                script = next((word for word in words if not word.startswith("-")), "")
+                files = [os.readlink(f"/proc/{pid}/exe"), name, script]
+                if executable in [Path(file).name for file in files]:
+                    return pid
+        return None
+
     def terminate(self) -> None:
         """Resume the program if it is stopped, and ask it to end (SIGTERM). It does not restart."""
         self._halt.touch()

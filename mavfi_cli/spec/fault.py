@@ -167,13 +167,23 @@ class FaultConfig:
 
         Raises:
             UnknownName: No program or effect has this name.
-            FaultSpecError: A process cannot have this effect, trigger or another setting.
+            FaultSpecError: A process cannot have this effect, trigger or another setting, or the
+                executable is not a file name.
         """
-        name = self.killed_node
+        name, slash, executable = (self.killed_node or "").partition("/")
         if name not in programs:
-            raise UnknownName("program", name or "", programs)
+            raise UnknownName("program", name, programs)
+        if slash and (not executable or "/" in executable or not executable.isprintable()):
+            raise FaultSpecError(
+                f"{self.target}: give the file name of the executable without its folder"
+            )
         effect = self.corruption().effect
         require_effect(self.target, effect, OF_PROCESSES)
+        if slash and effect is not Effect.FLIP:
+            raise FaultSpecError(
+                f"{self.target}: the effect {effect.value} strikes a program with all its "
+                f"processes; leave out /{executable}"
+            )
         self._check_trigger_of_process()
         plain = FaultConfig(
             target=self.target, seed=self.seed, at=self.at, effect=self.effect,
@@ -425,7 +435,7 @@ class InstructionConfig:
 
     def moment(self) -> FaultConfig:
         """Return a process fault, triggered at the moment from which instructions are counted."""
-        return FaultConfig(target=f"{PROCESS}.{self.program}", seed=self.seed, at=self.at)
+        return FaultConfig(target=f"{PROCESS}.{self.target}", seed=self.seed, at=self.at)
 
     def check_program(self, programs: Collection[str]) -> None:
         """Check that the fault is possible in a user's companion with these `programs`.
@@ -435,11 +445,6 @@ class InstructionConfig:
             FaultSpecError: A process cannot have this trigger, or the executable is not a file
                 name.
         """
-        _, slash, name = self.target.partition("/")
-        if slash and (not name or "/" in name or not name.isprintable()):
-            raise FaultSpecError(
-                f"{self.target}: give the file name of the executable without its folder"
-            )
         self.moment().check_program(programs)
 
     def describe(self, struck: str | None = None) -> str:

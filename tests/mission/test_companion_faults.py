@@ -269,6 +269,9 @@ def test_direction_and_components():
         (SETPOINT, {"at": "foreseen"}, FaultSpecError, "foreseen"),
         ("process.hop", {"effect": "zero"}, FaultSpecError, "got zero"),
         ("process.hop", {"effect": "slow=2"}, FaultSpecError, "at most 1"),
+        ("process.hop//bin/true", {}, FaultSpecError, "without its folder"),
+        ("process.hop/sleep", {"effect": "stop"}, FaultSpecError, "leave out /sleep"),
+        ("process.hopp/sleep", {}, UnknownName, "did you mean 'hop'"),
         ("process.hop", {"duration_s": 2.0}, FaultSpecError, "stop and slow a duration"),
         ("process.hop", {"exact_bits": (3,)}, FaultSpecError, "stop and slow a duration"),
         ("process.hop", {"persistence": "stuck-at"}, FaultSpecError, "stop and slow a duration"),
@@ -284,6 +287,37 @@ def test_faults_that_a_companion_cannot_have(target, settings, error, problem):
     hop = CompanionConfig(program={"hop": ProgramConfig(command="true")}, time_limit_s=20.0)
     with pytest.raises(error, match=problem.replace(".", "\\.")):
         check_companion_fault(FaultConfig(target=target, **settings), hop)
+
+
+def test_a_process_that_a_program_has_started_is_killed_and_the_program_goes_on(tmp_path):
+    task = {
+        "argv": ["sh", "-c", "sleep 600; echo over; sleep 600"], "folder": str(tmp_path),
+        "environment": {}, "restart": "never", "restart_s": 0.0, "ready_line": "over",
+    }  # fmt: skip
+    programs = Programs(tmp_path)
+    try:
+        program = programs.start("shell", task)
+        until_s = time.monotonic() + LONG_S
+        while program.process("sleep") is None:
+            assert time.monotonic() < until_s
+        fault = CompanionInjection(FaultConfig(target="process.shell/sleep", at="time=0"))
+        fault.running = {"shell": program}
+        fault.aim_at(1.0)
+        fault.begin(tmp_path / "fault.json")
+        fault.tick(at(0.0))
+        assert fault.finish()["state"] == "applied"
+        while not program.ready:
+            assert program.poll()
+            assert time.monotonic() < until_s
+        assert program.pid is not None
+        absent = CompanionInjection(FaultConfig(target="process.shell/absent", at="time=0"))
+        absent.running = {"shell": program}
+        absent.aim_at(1.0)
+        absent.begin(tmp_path / "absent.json")
+        absent.tick(at(0.0))
+        assert absent.finish()["reason"] == "the program was not running"
+    finally:
+        programs.close()
 
 
 @pytest.mark.parametrize("share", [0.5, 1.0])

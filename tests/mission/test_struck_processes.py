@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ from mavfi_cli.core import processes
 from mavfi_cli.fi.injector import Moment
 from mavfi_cli.mission.instruction import companion
 from mavfi_cli.mission.instruction.companion import ProcessInjection
+from mavfi_cli.mission.programs import RunningProgram
 from mavfi_cli.spec.fault import InstructionConfig
 
 # Starts a sleeping process, prints its number, and reads its status or does not.
@@ -49,7 +51,8 @@ def leader(request):
 def struck(monkeypatch, tmp_path, pid, executable):
     """An injection that has struck a process of a program, and the program."""
     monkeypatch.setattr(companion, "attack_moment", lambda *_, **__: None)
-    program, usual_s = SimpleNamespace(pid=pid, codes=[]), sys.getswitchinterval()
+    program, usual_s = SimpleNamespace(pid=pid, codes=[], poll=bool), sys.getswitchinterval()
+    program.process = partial(RunningProgram.process, program)
     request = InstructionConfig(target=f"fly{executable}", at="time=1", seed=1)
     injection = ProcessInjection(request, None)
     injection.running = {"fly": program}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import sys
 from pathlib import Path
@@ -119,7 +118,7 @@ class ProcessInjection(CompanionFault):
         program, path, request = self.running.get(self._request.program), self._path, self._request
         assert path is not None
         self._context["stamp_s"] = round(strike.stamp_s, 9)
-        pid = None if program is None else _process_of(program.pid, request.executable)
+        pid = None if program is None else program.process(request.executable)
         try:
             if program is None or pid is None:
                 raise ProcessLookupError
@@ -177,27 +176,3 @@ class ProcessInjection(CompanionFault):
         assert self._path is not None
         record.write(self._path, nothing)
         return nothing
-
-
-def _process_of(leader: int | None, executable: str | None) -> int | None:
-    """Return the id of the first process in a program's session that runs a given executable.
-
-    Return None if no such process exists.
-
-    Args:
-        leader: Id of the program's own process, which leads the session; None if it is not running.
-        executable: File name of the executable, or of the script that an interpreter runs. If None,
-            the leader itself is returned.
-    """
-    if leader is None or executable is None:
-        return leader
-    for pid in sorted(int(name) for name in os.listdir("/proc") if name.isdigit()):
-        with contextlib.suppress(OSError):  # it has ended, or is another user's
-            if os.getsid(pid) != leader:
-                continue
-            name, *words = map(os.fsdecode, Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"))
-            script = next((word for word in words if not word.startswith("-")), "")
-            files = [os.readlink(f"/proc/{pid}/exe"), name, script]
-            if executable in [Path(file).name for file in files]:
-                return pid
-    return None
