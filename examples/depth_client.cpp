@@ -16,7 +16,8 @@ struct Header {  // 56 bytes without padding, little-endian
     float hfov_rad, position_enu_m[3], quaternion_wxyz[4];
 };
 
-int main(int, char **arguments) {
+int main(int count, char **arguments) {
+    if (count != 3) return 2;
     sockaddr_un address{AF_UNIX, {}};
     std::strncpy(address.sun_path, arguments[1], sizeof address.sun_path - 1);
     int link = socket(AF_UNIX, SOCK_STREAM, 0);
@@ -25,8 +26,7 @@ int main(int, char **arguments) {
     Header h;
     for (int left = std::atoi(arguments[2]); left > 0; --left) {
         if (recv(link, &h, sizeof h, MSG_WAITALL) != sizeof h) return 1;
-        if (std::memcmp(h.magic, "MAVFI-D1", 8) || !h.columns || !h.rows) return 1;
-        if (h.columns > 2048 || h.rows > 2048) return 1;
+        if (std::memcmp(h.magic, "MAVFI-D1", 8) || h.columns - 1 > 2047 || h.rows - 1 > 2047) return 1;
         depth_m.resize(h.columns * h.rows);
         ssize_t size = depth_m.size() * sizeof(float);
         if (recv(link, depth_m.data(), size, MSG_WAITALL) != size) return 1;

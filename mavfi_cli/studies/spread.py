@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from mavfi_cli.core.files import plain
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_to_end
 from mavfi_cli.mission.run_folder import Run
@@ -59,19 +60,21 @@ class Spread:
         share, low, high = (100.0 * value for value in self.succeeded)
         flown = ", ".join(f"{name} {count}" for name, count in sorted(self.outcomes.items()))
         least, median, most = self.flight_time_s
-        return [
-            f"Outcomes    {flown}, of {total}: success {share:.1f} % ({low:.1f} to {high:.1f})",
-            f"Time        {median:.2f} s median, {least:.2f} to {most:.2f} s",
-            f"Path        {self.apart_m[0]:.2f} m median, {self.apart_m[1]:.2f} m largest distance "
-            "from the first flight",
+        lines = [
+            f"Outcomes    {flown}, of {total}: success {share:.1f} % ({low:.1f} to {high:.1f})"
         ]
+        if not math.isnan(median):
+            lines.append(f"Time        {median:.2f} s median, {least:.2f} to {most:.2f} s")
+        if not math.isnan(self.apart_m[0]):
+            lines.append(
+                f"Path        {self.apart_m[0]:.2f} m median, {self.apart_m[1]:.2f} m largest "
+                "distance from the first flight"
+            )
+        return lines
 
     def as_dict(self) -> dict[str, Any]:
         """Return the attributes as plain values, with None in place of NaN."""
-        return {
-            name: [_known(number) for number in value] if isinstance(value, tuple) else value
-            for name, value in asdict(self).items()
-        }
+        return dict(plain(asdict(self)))
 
 
 def fly_spread(config: MissionConfig, count: int, out: Path, watcher: Watcher) -> Spread:
@@ -94,7 +97,3 @@ def _at(values: Sequence[float], share: float) -> float:
     If the quantile lies between two values, the upper one is returned.
     """
     return values[min(int(share * len(values)), len(values) - 1)] if values else math.nan
-
-
-def _known(number: float) -> float | None:
-    return None if math.isnan(number) else number

@@ -188,6 +188,13 @@ def test_a_message_is_dropped_repeated_swapped_or_late(effect, numbers):
     assert late == ([(0, Side.COMPANION)] if "late" in effect else [])
 
 
+def test_messages_are_dropped_for_a_time_and_fields_set_to_zero():
+    link = injector(SETPOINT, effect="drop", persistence="stuck-at", duration_s=0.25)
+    assert [m.time_boot_ms for m in passed(link, map(setpoint, range(5)))] == [3, 4]
+    zero = injector(f"{SETPOINT}.vx", effect="zero")
+    assert [m.vx for m in passed(zero, map(setpoint, range(2)))] == [0.0, 2.0]
+
+
 def test_a_swapped_message_follows_the_next_of_its_own_side():
     link = injector("HEARTBEAT", effect="swap")
     ours, theirs = (

@@ -1,8 +1,11 @@
 """Flights of a user's own companion: the outcome, the record, and what becomes of bad ones."""
 
+import contextlib
 import math
 import os
+import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from live_processes import LONG_S, gone
 from made_flights import companion_gate
 
 from mavfi_cli import library
@@ -83,6 +87,38 @@ def test_a_flight_leaves_a_record_as_any_other(fly):
     assert ViewedFlight(name="flight", run=run, recorder=None).run is run
     with pytest.raises(RecordError, match="is not repeatable"):
         fly_again(run, run.folder.path.parent)
+
+
+def family(pid):
+    """A process and all of its descendants."""
+    found = [pid]
+    for number in found:
+        with contextlib.suppress(OSError):
+            for own in Path(f"/proc/{number}/task").glob("*/children"):
+                found += map(int, own.read_text().split())
+    return found
+
+
+@pytest.mark.slow
+def test_no_process_outlives_a_killed_mavfi(tmp_path):
+    script = tmp_path / "start.sh"
+    script.write_text(f'setsid sleep 600 & exec {sys.executable} {HOP} "$1" 1 waits\n')
+    (tmp_path / "hop.toml").write_text('[program.hop]\ncommand = "sh start.sh {link}"\n')
+    line = ["fly", "--companion", "hop.toml", "--world", "farm", "--quiet", "--out", "runs"]
+    mavfi = subprocess.Popen([sys.executable, "-m", "mavfi_cli", *line], cwd=tmp_path)
+    until_s = time.monotonic() + LONG_S
+    while not any(
+        "ready" in own.read_text() for own in tmp_path.glob("runs/*/programs/hop/stdout")
+    ):
+        assert time.monotonic() < until_s
+        time.sleep(0.1)
+    processes = family(mavfi.pid)
+    lines = [Path(f"/proc/{pid}/cmdline").read_bytes() for pid in processes]
+    for word in (b"sitl", b"hop.py", b"sleep"):
+        assert any(word in line for line in lines), word
+    mavfi.kill()
+    mavfi.wait()
+    assert all(map(gone, processes[1:]))
 
 
 @pytest.mark.slow

@@ -41,3 +41,4 @@ def test_nothing_is_known_of_flights_that_all_failed(tmp_path):
     spread = Spread.of([run(tmp_path / "0", "crash", 1.0, 0.0)])
     assert all(map(math.isnan, (*spread.flight_time_s, *spread.apart_m)))
     assert spread.as_dict()["apart_m"] == [None, None]
+    assert len(spread.lines()) == 1
