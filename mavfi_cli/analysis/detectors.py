@@ -208,19 +208,13 @@ class FaultRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _CorrectedTest:
+class _CorrectedTest(McNemar):
     """McNemar's test of two detectors on the same faults, with a corrected p-value.
 
     Attributes:
         corrected_p: `p_value` after Holm's correction over all comparisons of the same kind.
     """
 
-    both: int
-    only_first: int
-    only_second: int
-    neither: int
-    p_value: float
-    difference: float
     corrected_p: float
 
 
@@ -495,7 +489,7 @@ def _comparisons(detectors: Sequence[str], faults: pa.Table) -> list[DetectorCom
     tests = [_recoveries(*(chosen(faults, detector=name) for name in two)) for two in names]
     recovered, undone = (
         [
-            _CorrectedTest(**asdict(test), difference=test.difference, corrected_p=corrected)
+            _CorrectedTest(**asdict(test), corrected_p=corrected)
             for test, corrected in zip(kind, holm([test.p_value for test in kind]), strict=True)
         ]
         for kind in ([own[0] for own in tests], [own[1] for own in tests])

@@ -17,7 +17,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -166,16 +166,6 @@ class ChangedQuantity(Interval):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _SuccessChange(McNemar):
-    """McNemar's test of success on two platforms, with the difference of the success rates.
-
-    The difference is NaN if no mission was flown on both platforms.
-    """
-
-    difference: float = field()  # replaces the base class's property, so that `asdict` has it
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RatioRow:
     """The comparison of a platform with the reference platform over the same missions.
 
@@ -191,7 +181,7 @@ class RatioRow:
     reference: str
     pairs: int
     both_succeed: int
-    success: _SuccessChange
+    success: McNemar
     quantities: dict[str, ChangedQuantity]
 
 
@@ -416,7 +406,7 @@ def _ratio(
         reference=reference,
         pairs=test.pairs,
         both_succeed=test.both,
-        success=_SuccessChange(**asdict(test), difference=test.difference),
+        success=test,
         quantities={quantity.name: _changed(quantity, *pairs) for quantity in QUANTITIES},
     )
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,8 @@ class McNemar:
         both, neither: number of pairs in which both treatments succeeded, or neither.
         only_first, only_second: number of pairs in which only that treatment succeeded.
         p_value: two-sided p-value of equal success rates; see `of`.
+        difference: success rate under the second treatment minus that under the first, weighted in
+            a stratified sample; NaN without pairs.
     """
 
     both: int
@@ -44,6 +46,7 @@ class McNemar:
     only_second: int
     neither: int
     p_value: float
+    difference: float
 
     @staticmethod
     def of(
@@ -77,41 +80,26 @@ class McNemar:
         neither, only_second, only_first, both = np.bincount(ends, minlength=4).tolist()
         differing = only_first + only_second
         p_value = float(binomtest(only_first, differing).pvalue) if differing else 1.0
+        changes = np.asarray(second, np.int64) - np.asarray(first, np.int64)
         test = McNemar(
             both=both,
             only_first=only_first,
             only_second=only_second,
             neither=neither,
             p_value=p_value,
+            difference=float(np.average(changes, weights=weights)) if len(changes) else math.nan,
         )
-        changes = np.asarray(second, np.int64) - np.asarray(first, np.int64)
         if clusters is not None and len(changes):
             sums = np.bincount(np.unique(clusters, return_inverse=True)[1], changes)
             return replace(test, p_value=sign_flips(sums.tolist()))
         if weights is None:
             return test
-        weighted = weights * changes
-        return _WeightedMcNemar(
-            **{**asdict(test), "p_value": sign_flips(weighted.tolist())},
-            difference=float(weighted.sum() / weights.sum()) if len(weighted) else math.nan,
-        )
+        return replace(test, p_value=sign_flips((weights * changes).tolist()))
 
     @property
     def pairs(self) -> int:
         """Number of pairs."""
         return self.both + self.only_first + self.only_second + self.neither
-
-    @property
-    def difference(self) -> float:
-        """Success rate under the second treatment minus that under the first; NaN without pairs."""
-        return (self.only_second - self.only_first) / self.pairs if self.pairs else math.nan
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _WeightedMcNemar(McNemar):
-    """McNemar's test of a stratified sample, with the weighted difference of success rates."""
-
-    difference: float = field()
 
 
 def sign_flips(differences: Sequence[float]) -> float:
