@@ -6,10 +6,12 @@ r"""Counts the flights of a user's companion that faults lose, with and without 
 
 Reads exports of campaigns (`mavfi campaign export`) with golden flights, null faults, and faults in
 instructions or messages. A fault struck if the record has its activation. It is dead if its process
-ended, and silent if it was read and its process did not end. A flight is lost if it does not end in
-success. Intervals are Wilson's, 95 %; p is that of Fisher's exact test. --by adds the lost flights
-by one column, or by several together, with p corrected by Holm for the rows. With --whole, a flight
-that covers less than three quarters of the median golden distance is lost, too.
+ended, and silent if it was read and its process did not end. A process that a program has started
+and that ends with an exit code is not dead if the flight succeeds, because the program ended
+without an error. A flight is lost if it does not end in success. Intervals are Wilson's, 95 %; p is
+that of Fisher's exact test. --by adds the lost flights by one column, or by several together, with
+p corrected by Holm for the rows. With --whole, a flight that covers less than three quarters of the
+median golden distance is lost, too.
 
 Flights before 30 November 2026 do not record the end of a process that a program has started, such
 as `mavsdk_server`, if the program fails at the same time. Such a fault therefore counts as dead if
@@ -83,8 +85,10 @@ def _by(names: Sequence[str], struck: list[list[Row]]) -> None:
 
 
 def _dead(row: Row) -> bool:
-    child = "/" in (row["label_site"] or "")
-    return bool(row["node_ended"] or (child and "ended with code 1" in (row["reason"] or "")))
+    child, ended = "/" in (row["label_site"] or ""), row["node_ended"] or ""
+    if child and ended.startswith("ended with code") and not lost(row):
+        return False
+    return bool(ended or (child and "ended with code 1" in (row["reason"] or "")))
 
 
 def _silent(row: Row) -> bool:

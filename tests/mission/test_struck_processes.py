@@ -15,6 +15,7 @@ import pytest
 from live_processes import gone
 
 from mavfi_cli.core import processes
+from mavfi_cli.core.processes import Ended
 from mavfi_cli.fi.injector import Moment
 from mavfi_cli.mission.instruction import companion
 from mavfi_cli.mission.instruction.companion import ProcessInjection
@@ -122,6 +123,26 @@ def test_a_process_that_its_program_ends_before_its_own_end_is_not_dead(
     assert not deaths(injection, 2.0)
     program.pid, program.codes = None, [0]
     assert not deaths(injection, 9.0)
+    injection.close()
+
+
+@pytest.mark.parametrize("leader", ["does not read"], indirect=True)
+@pytest.mark.parametrize(
+    ("end", "codes", "usual"),
+    [
+        (Ended.of(1), [0], True),  # as MAVProxy ends when its input does
+        (Ended.of(1), [1], False),
+        (Ended.of(1), [], False),
+        (Ended.of(-signal.SIGSEGV), [0], False),
+        (Ended(exit_code=None, signal=None), [0], False),
+    ],
+)
+def test_an_exit_code_is_no_death_if_the_program_ends_without_an_error(
+    monkeypatch, tmp_path, leader, end, codes, usual
+):
+    injection, program = struck(monkeypatch, tmp_path, leader[0].pid, "/sleep")
+    injection._end, program.codes = (2.0, end), codes
+    assert injection._ended_as_usual() is usual
     injection.close()
 
 

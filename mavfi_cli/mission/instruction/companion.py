@@ -153,9 +153,16 @@ class ProcessInjection(CompanionFault):
             written["symbol"] = symbol
             assert self._path is not None
             record.write(self._path, written)
-        if not (written.get("injection") or {}).get("applied"):
+        if not (written.get("injection") or {}).get("applied") or self._ended_as_usual():
             self.ends = {}  # the process ended by itself
         return record.repeatable(written)
+
+    def _ended_as_usual(self) -> bool:
+        """Return True if a process's exit code was no failure to the program that started it."""
+        program = self.running.get(self._request.program)
+        fine = program is not None and program.codes[-1:] == [0]
+        code = None if self._end is None else self._end[1].exit_code
+        return fine and not self._leads and code is not None
 
     def _symbol(self) -> str:
         with contextlib.suppress(MavfiError, OSError):
