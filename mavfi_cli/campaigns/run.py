@@ -73,7 +73,7 @@ class Options:
     Attributes:
         jobs: number of concurrent missions.
         limit_s: wall time limit of one mission, in seconds; a longer mission is recorded as `hang`.
-            A mission that keeps pace with the wall clock gets its time limit in addition.
+            None selects LIMIT_S, and for a mission in real time its time limit in addition.
         task: name of the module that flies a mission.
         whole: fly every mission from its own start, instead of forking several from a shared
             flight. The records are the same.
@@ -94,7 +94,7 @@ class Options:
 
     jobs: int = 0  # 0 selects the number of cores
     keep: Keep = Keep.FAILURES
-    limit_s: float = LIMIT_S
+    limit_s: float | None = None
     task: str = TASK
     whole: bool = False
     errors: bool = False
@@ -107,7 +107,7 @@ class Options:
     programs: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.limit_s < math.inf:
+        if self.limit_s is not None and not 0.0 < self.limit_s < math.inf:
             raise ConfigError(f"must be above 0 and finite, got {self.limit_s:g}", key="limit")
         if self.cluster is not None and not _is_address(self.cluster):
             # dask would retry for half a minute, and then raise a traceback
@@ -500,7 +500,8 @@ class _Run:
             workers.start(attempts, self._limit_s(missions[0].config), alone)
 
     def _limit_s(self, config: MissionConfig) -> float:
-        return self._options.limit_s + config.paced_s
+        given_s = self._options.limit_s
+        return LIMIT_S + config.paced_s if given_s is None else given_s
 
     def _next(self) -> list[MissingMission]:
         """Return the missions of the next flight: one, or several that share it."""

@@ -76,9 +76,9 @@ def campaign() -> None:
 @_execution("--companion", metavar="FILE|CMD",
             help="User's companion to trust: the missions of a folder execute no other "
                  "one.")  # fmt: skip
-@_execution("--limit", "limit_s", type=types.ABOVE_ZERO, default=900.0,
-            help="Wall time limit of a mission, s, to which a mission in real time adds its time "
-                 "limit; missions that exceed it are recorded as `hang`.")  # fmt: skip
+@_execution("--limit", "limit_s", type=types.ABOVE_ZERO,
+            help="Wall time limit of a mission, s; missions that exceed it are recorded as `hang`  "
+                 "[900, and in real time the mission's time limit in addition].")  # fmt: skip
 @_execution("--whole", is_flag=True,
             help="Fly every mission from its start. By default missions that differ only in their "
                  "fault are forked from one flight; their records are the same.")  # fmt: skip

@@ -99,8 +99,9 @@ COMMANDS = {
     # which are empty without a user's companion; all else is equal.
     # Renewed when its missions got a time limit of 40 s, which one of them reaches.
     # Renewed when exports got `alarm_count`; all else is equal.
+    # Renewed when McNemar's tests got `difference`; all else is equal.
     "campaign": (
-        "b00f8b4be213d00d",
+        "29c35d446af9959f",
         ["campaign", "run", "hashed.toml", "--quiet", "--out", "c", "--json"],
         ["campaign", "status", "c", "--quality", "--failures", "--json"],
         ["campaign", "export", "c", "-"],
@@ -123,8 +124,9 @@ COMMANDS = {
         ],
     ),
     # Renewed when harm began at 10 % and `otherwise` and `golden` went (schema 2).
+    # Renewed when McNemar's tests got `difference`; all else is equal.
     "evaluate": (
-        "b06f546e29ba2582",
+        "15ba5068bdbd7d8d",
         [
             *("detect", "evaluate", "--world", "lawn.toml", "--detector", "none,gad"),
             *("--flights", "1", "--golden-flights", "1", "--field", "exponent"),
