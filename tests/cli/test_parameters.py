@@ -180,7 +180,6 @@ PLANS = [
     (("train",), TrainingPlan),
     (("vpm",), Choices),
     (("vpm",), RedundancyPlan),
-    (("campaign", "run"), run.Options),
 ]
 
 
