@@ -238,9 +238,9 @@ class CompanionInjection(CompanionFault, SourceInjection):
     @property
     def _struck_pid(self) -> int | None:
         """Id of the process that the fault strikes; None while it does not run."""
-        executable = (self._config.killed_node or "").partition("/")[2] or None
-        running = self._target is not None and self._target.poll()
-        return self._target.process(executable) if running and self._target is not None else None
+        if (program := self._target) is None or not program.poll():
+            return None
+        return program.process((self._config.killed_node or "").partition("/")[2] or None)
 
     def _target_runs(self) -> bool:
         return self._struck_pid is not None

@@ -208,7 +208,8 @@ class _Watch:
     def __init__(self, process: str | None) -> None:
         self._process = process
         self._next_s, self._gone = 0.0, ""
-        self._number, self._watch = 0, None  # type: int, EndWatch | None
+        self._number = 0
+        self._watch: EndWatch | None = None
 
     def gone(self) -> str:
         """Return a message if the companion's process is gone, or an empty string if it is not.

@@ -307,22 +307,22 @@ def test_a_process_that_a_program_has_started_is_killed_and_the_program_goes_on(
         until_s = time.monotonic() + LONG_S
         while program.process("sleep") is None:
             assert time.monotonic() < until_s
-        fault = CompanionInjection(FaultConfig(target="process.shell/sleep", at="time=0"))
-        fault.running = {"shell": program}
-        fault.aim_at(1.0)
-        fault.begin(tmp_path / "fault.json")
-        fault.tick(at(0.0))
-        assert fault.finish()["state"] == "applied"
+
+        def struck(executable):
+            target = f"process.shell/{executable}"
+            fault = CompanionInjection(FaultConfig(target=target, at="time=0"))
+            fault.running = {"shell": program}
+            fault.aim_at(1.0)
+            fault.begin(tmp_path / "fault.json")
+            fault.tick(at(0.0))
+            return fault.finish()
+
+        assert struck("sleep")["state"] == "applied"
         while not program.ready:
             assert program.poll()
             assert time.monotonic() < until_s
         assert program.pid is not None
-        absent = CompanionInjection(FaultConfig(target="process.shell/absent", at="time=0"))
-        absent.running = {"shell": program}
-        absent.aim_at(1.0)
-        absent.begin(tmp_path / "absent.json")
-        absent.tick(at(0.0))
-        assert absent.finish()["reason"] == "the program was not running"
+        assert struck("absent")["reason"] == "the program was not running"
     finally:
         programs.close()
 
