@@ -33,7 +33,9 @@ PERCENT = 100.0
 EVERY_STAGE = "+".join(STAGES)
 LONGER = 1.10  # a flight is longer if its time is above this multiple of its golden flight's
 _COLUMNS: Mapping[str, pa.DataType] = {
-    **dict.fromkeys(("number", "seed", "world_seed", "fault_seed", "fault_bits"), pa.int64()),
+    **dict.fromkeys(
+        ("number", "seed", "world_seed", "fault_seed", "fault_bits", "alarm_count"), pa.int64()
+    ),
     **dict.fromkeys((
         "pair", "world", "planner", "platform", "stack", "level", "fault_target", "fault_field",
         "detector", "protect", "state", "outcome", "injected", "activation",

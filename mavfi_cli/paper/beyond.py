@@ -1,7 +1,8 @@
 """Analyses that go beyond the paper.
 
 They trace a fault from the kernel to the mission, map where a flipped bit does harm, count failures
-per hour, compare what each mechanism saves, and measure what restarting a dead node saves.
+per hour, compare what each mechanism saves, measure what restarting a dead node saves, and count
+what faults cost a user's companion.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.analysis.pairs import Fate, Flights
-from mavfi_cli.campaigns.missions import canonical
+from mavfi_cli.campaigns.missions import Injected, canonical
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import BY_NAME, DType
 from mavfi_cli.paper.items import place_of, printed
@@ -396,3 +397,83 @@ def _restarts(
 def _rule(delay_s: float) -> str:
     never = delay_s >= LIMITS["node_restart_s"][1]
     return "never back" if never else f"back after {delay_s:g} s"
+
+
+# What faults cost a user's companion --------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CompanionArm:
+    """Flights of a user's companion with one kind of fault, without the gate or with it.
+
+    These flights are not repeatable, so arms are independent samples.
+
+    Attributes:
+        companion: the companion's file, and the autopilot if it is not mavfi's own.
+        target: the struck process, message or field; empty for flights without a fault.
+        detector: the gate's detector; None without a gate.
+        lost: share of lost flights: of all, of the silent faults (read, and no process ended), and
+            of those that ended a process. Only that of all without a fault.
+        alarmed: share of flights in which the gate raised an alarm; None without a gate.
+        hours: duration of all flights together.
+        p_value: p-value of Fisher's exact test of all lost flights against those without a gate,
+            corrected for the arms of the campaign by Holm's method; None without a gate or a
+            fault, and if the fault was flown only with a gate.
+    """
+
+    companion: str
+    target: str
+    detector: str | None
+    lost: Mapping[Fate, Share]
+    alarmed: Share | None
+    hours: float
+    p_value: float | None = None
+
+
+def companion_arms(flights: Flights) -> list[CompanionArm]:
+    """Return the arms of a campaign's flights of users' companions, those without a fault first.
+
+    Null faults, and faults that did not strike, are omitted.
+    """
+    mine = flights.chosen(repeats=False, injected=(Injected.GOLDEN.value, *_HITS))
+    places = zip(mine["changes"], mine["fault_target"], mine["detector"], strict=True)
+    keys = [(_companion(changes), target or "", gate or "") for changes, target, gate in places]
+    found = {
+        (companion, target, gate): _companion_arm(companion, target, gate, those)
+        for (companion, target, gate), those in mine.grouped(keys).items()
+    }
+    tested = {
+        (companion, target, gate): plain.lost[Fate.ALL].fisher(arm.lost[Fate.ALL])
+        for (companion, target, gate), arm in found.items()
+        if target and gate and (plain := found.get((companion, target, "")))
+    }
+    corrected = dict(zip(tested, holm([*tested.values()]), strict=True))
+    return [replace(found[key], p_value=corrected.get(key)) for key in sorted(found)]
+
+
+_HITS = (
+    Injected.ACTIVE.value, Injected.UNREAD.value, Injected.CAUGHT.value,
+    Injected.NOT_ACTIVATED.value,
+)  # fmt: skip
+
+
+def _companion(changes: str) -> str:
+    config = json.loads(changes)
+    autopilot = config.get("autopilot")
+    return Path(config["companion"]).name + (f" on {autopilot}" if autopilot else "")
+
+
+def _companion_arm(companion: str, target: str, gate: str, flights: Flights) -> CompanionArm:
+    alarms = [bool(count) for count in flights["alarm_count"]]
+    fates = {Fate.ALL: flights}
+    if target:
+        fates[Fate.SILENT] = flights.chosen(ended=False, activation="read")
+        fates[Fate.DEAD] = flights.chosen(ended=True)
+    return CompanionArm(
+        companion=companion,
+        target=target,
+        detector=gate or None,
+        lost={fate: those.share() for fate, those in fates.items()},
+        alarmed=wilson(sum(alarms), len(alarms)) if gate else None,
+        hours=float(flights.known("flight_time_s").sum()) / 3600.0,
+    )

@@ -34,11 +34,13 @@ from mavfi_cli.paper.answers import (
 from mavfi_cli.paper.beyond import (
     BIT_CLASSES,
     Arm,
+    CompanionArm,
     HourlyFailures,
     KernelFlow,
     MapCell,
     RestartComparison,
     arms,
+    companion_arms,
     hourly_failures,
     kernel_flows,
     restarts,
@@ -189,6 +191,7 @@ class Document:
     arms: Mapping[str, Sequence[Arm]]
     arm_pictures: Mapping[str, Picture]
     restarts: Sequence[RestartComparison]
+    companions: Mapping[str, Sequence[CompanionArm]]
     sources: Sequence[CampaignSource]
     kernel_sources: Sequence[KernelSummary]
     missions: Sequence[_CampaignMissions]
@@ -284,6 +287,11 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         arms=by_arm,
         arm_pictures={name: _arm_picture(name, mine) for name, mine in by_arm.items()},
         restarts=restarts(evidence.flights().comparable),
+        companions={
+            source.name: found
+            for source in evidence.campaigns
+            if (found := companion_arms(source.flights))
+        },
         sources=evidence.campaigns,
         kernel_sources=evidence.kernels,
         missions=[*_missions(evidence.campaigns)],

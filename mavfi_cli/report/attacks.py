@@ -236,7 +236,7 @@ class _KernelCounts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class KernelsSummary:
+class _KernelsSummary:
     """The results of an attack campaign on isolated kernels.
 
     Attributes:
@@ -272,7 +272,7 @@ class KernelsSummary:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ProgramSummary:
+class _ProgramSummary:
     """The results of an attack campaign on one program."""
 
     runs: TargetRuns
@@ -320,13 +320,13 @@ class ProgramSummary:
         return "\n".join([*lines, *self.counts.lines("")])
 
 
-def summarise(plan: Plan, campaign: Sequence[TargetRuns]) -> KernelsSummary | ProgramSummary:
+def summarise(plan: Plan, campaign: Sequence[TargetRuns]) -> _KernelsSummary | _ProgramSummary:
     """Summarise the runs of an attack campaign on kernels or on a program."""
     sampling, first = plan.strategy().name, campaign[0]
     if isinstance(first.target, KernelTarget):
         kernels = [_KernelCounts.of(runs) for runs in campaign]
-        return KernelsSummary(plan=plan.to_json(first.target), sampling=sampling, kernels=kernels)
-    return ProgramSummary(
+        return _KernelsSummary(plan=plan.to_json(first.target), sampling=sampling, kernels=kernels)
+    return _ProgramSummary(
         runs=first, sampling=sampling, seed=plan.seed, counts=_TargetCounts.of(first)
     )
 
@@ -390,7 +390,7 @@ def _input(runs: TargetRuns, number: int) -> Json:
 
 
 def save_runs(
-    folder: Path, summary: KernelsSummary | ProgramSummary, campaign: Sequence[TargetRuns]
+    folder: Path, summary: _KernelsSummary | _ProgramSummary, campaign: Sequence[TargetRuns]
 ) -> Sequence[str]:
     """Write the results of a campaign to a folder: CSV, JSON and, for kernels, a picture.
 
@@ -405,7 +405,7 @@ def save_runs(
         RecordError: a file cannot be written.
     """
     contents, columns = summary.as_dict(), KERNEL_COLUMNS
-    if isinstance(summary, ProgramSummary):
+    if isinstance(summary, _ProgramSummary):
         (runs,) = campaign
         golden = {name: getattr(runs.golden, name) for name in ("exit_code", "cpu_s", "wall_s")}
         contents = {"summary": contents, "golden": golden, "runs": list(runs.records)}
@@ -413,7 +413,7 @@ def save_runs(
     rows = (_cells(entry, columns) for runs in campaign for entry in runs.records)
     write_text(folder / "kernels.csv", Table.of_records(rows, columns).csv())
     write_json(folder / KERNELS, contents)
-    if isinstance(summary, ProgramSummary):
+    if isinstance(summary, _ProgramSummary):
         return KERNELS, "kernels.csv"
     write_figure(_kernel_figure(summary), folder / "kernels.svg")
     return KERNELS, "kernels.csv", "kernels.svg"
@@ -439,7 +439,7 @@ _VISIBLE = 0.5  # per cent; minimum width of a drawn interval
 _LABELS = {"benign": "benign", "crash": "crash", "hang": "hang", "sdc": "SDC"}
 
 
-def _kernel_figure(summary: KernelsSummary) -> Figure:
+def _kernel_figure(summary: _KernelsSummary) -> Figure:
     """Draw one bar per kernel, divided into the outcomes of its injected runs in per cent."""
     kernels = summary.kernels
     figure = new_figure(max(5.2, 1.8 + 1.05 * len(kernels)), 4.4)

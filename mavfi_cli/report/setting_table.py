@@ -15,8 +15,8 @@ BY_WEIGHT = (
 )
 
 UNPAIRED = (
-    "a user's companion: the fault repeats and the flight does not, so settings are compared "
-    "unpaired"
+    "a user's companion: the fault repeats, but the flight only in lockstep, so settings are "
+    "compared unpaired"
 )
 
 

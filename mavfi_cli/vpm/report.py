@@ -108,7 +108,7 @@ class SchemeResult:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SensitivityPoint:
+class _SensitivityPoint:
     """The results at one value of a varied parameter. They are None if the vehicle cannot fly."""
 
     value: float
@@ -129,7 +129,7 @@ class Sensitivity:
     value: float
     velocity_elasticity_ratio: float | None
     tmr_time_elasticity_ratio: float | None
-    points: tuple[SensitivityPoint, ...]
+    points: tuple[_SensitivityPoint, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -458,8 +458,8 @@ def _sensitivities(inputs: ModelInputs, schemes: Mapping[str, Scheme]) -> list[S
     return rows
 
 
-def _point(inputs: ModelInputs, value: float, schemes: Mapping[str, Scheme]) -> SensitivityPoint:
-    return SensitivityPoint(
+def _point(inputs: ModelInputs, value: float, schemes: Mapping[str, Scheme]) -> _SensitivityPoint:
+    return _SensitivityPoint(
         value=value,
         velocity_mps=inputs.velocity_mps(schemes[REFERENCE]),
         tmr_flight_time_ratio=_time_ratio(inputs, schemes, "tmr"),

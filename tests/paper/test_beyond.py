@@ -3,7 +3,14 @@
 import pytest
 from made_flights import flights, row
 
-from mavfi_cli.paper.beyond import arms, hourly_failures, kernel_flows, restarts, state_map
+from mavfi_cli.paper.beyond import (
+    arms,
+    companion_arms,
+    hourly_failures,
+    kernel_flows,
+    restarts,
+    state_map,
+)
 
 LOST = {"outcome": "timeout"}
 
@@ -184,3 +191,30 @@ def test_restart_rules_in_fixed_worlds_are_compared_apart_from_those_in_others()
 
 def test_one_restart_rule_is_no_comparison():
     assert not restarts(flights([row(seed=1), under(5.0, 1)]))
+
+
+def test_a_users_companion_is_counted_with_and_without_its_gate():
+    config = {"companion": "fly.toml", "autopilot": "px4"}
+    rows = [row(seed=1, config=config), row(seed=2, config=config, detector="gad", alarm_count=1)]
+    for seed in range(1, 21):
+        mine = {"seed": seed, "instruction": True, "config": config}
+        rows += [row("fly/server", **mine, node_ended="killed by SIGSEGV", **LOST)]
+        rows += [row("fly/server", **mine, detector="gad", alarm_count=seed % 2)]
+        rows += [row("fly/other", **mine, detector="gad", **LOST)]
+    rows += [row("fly/server", seed=30, instruction=True, config=config, injected="null", **LOST)]
+    rows += [row(seed=40), row("planning", seed=40, **LOST)]  # not of a companion
+    found = {(arm.target, arm.detector): arm for arm in companion_arms(flights(rows))}
+    assert {arm.companion for arm in found.values()} == {"fly.toml on px4"}
+    counts = {key: [each.counts for each in arm.lost.values()] for key, arm in found.items()}
+    assert counts == {
+        ("", None): ["0 of 1"],
+        ("", "gad"): ["0 of 1"],
+        ("fly/other", "gad"): ["20 of 20", "20 of 20", "0 of 0"],
+        ("fly/server", None): ["20 of 20", "0 of 0", "20 of 20"],
+        ("fly/server", "gad"): ["0 of 20", "0 of 20", "0 of 0"],
+    }
+    assert found["", "gad"].alarmed.counts == "1 of 1"
+    assert found["fly/server", "gad"].alarmed.counts == "10 of 20"
+    assert found["fly/server", "gad"].p_value < 1e-9
+    assert found["fly/server", None].p_value is None
+    assert found["fly/other", "gad"].p_value is None  # not flown without the gate
