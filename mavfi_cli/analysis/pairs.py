@@ -23,7 +23,7 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import FloatArray, Outcome, Stage
 from mavfi_cli.spec.detector import PAPER
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
-from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.mission import LIMITS, MissionConfig
 from mavfi_cli.stats.paired import OWN, McNemar, WorstCase
 from mavfi_cli.stats.shares import Share, design_effect, wilson
 
@@ -53,10 +53,10 @@ _MOST_NAMED = 8  # worlds that a line lists
 _STRUCK = (Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT, Injected.NOT_ACTIVATED)
 _FAULTS = ("fault", "instruction")
 # A mission is one of the paper's if it differs from the defaults only in these, and its fault only
-# in _DRAWN.
+# in _DRAWN. With a fault in an instruction, the restart delay may differ, too.
 _PAPER = {*_FAULTS, "detector", "isolate", "stack", "world", "seed", "world_seed", "planner",
           "platform", "time_limit_s"}  # fmt: skip
-_DRAWN = {"target", "seed", "field", "bits", "together", "at"}
+_DRAWN = {"target", "seed", "field", "bits", "together", "at", "compat"}
 _USUAL: Mapping[str, Any] = json.loads(canonical({
     "fault": asdict(FaultConfig(target="")), "instruction": asdict(InstructionConfig(target="")),
 }))  # fmt: skip
@@ -103,11 +103,13 @@ class Flights:
         together: whether the fault strikes all components of a group at once.
         at: the trigger of a source-level fault; null without such a fault.
         as_paper: whether vehicle, speed, sensors, the single flip of random bits and the 13 watched
-            states are those of the paper. Stack, detector model and `at` may differ.
+            states are those of the paper. Stack, detector model and `at` may differ, and for faults
+            in instructions `restart_s` and `injector`.
         struck: whether the fault flipped a bit, read or not, as in the paper's counts.
         lost: whether the mission did not end in success.
         ended: whether a node crashed or hung.
         restart_s: time after which a dead node is restarted.
+        injector: the copied injector of a fault in an instruction, or an empty string.
         repeats: whether the flight is repeatable. A flight of a user's companion is not, so it is
             not paired with a golden flight.
     Columns about the golden flight of the same mission:
@@ -280,6 +282,20 @@ class Flights:
         }
 
     @property
+    def by_rules(self) -> dict[str, Flights]:
+        """The flights by injector and restart rule of their faults in instructions.
+
+        The first key is an empty string: mavfi's own injector, and dead nodes that come back after
+        1 s. All other faults belong to it, and flights without a fault to every rule.
+        """
+        levels = zip(self["level"], self["injector"], self["restart_s"], strict=True)
+        rules = [
+            level and (_rule(*how) if level == "instruction" else "") for level, *how in levels
+        ]
+        names = ["", *sorted({rule for rule in rules if rule})]
+        return {name: self.where(rule in (None, name) for rule in rules) for name in names}
+
+    @property
     def seeds(self) -> list[tuple[str, int]]:
         """The world and the seed of each flight. Flights that share both are not independent."""
         return list(zip(self["world"], self["seed"], strict=True))
@@ -405,6 +421,17 @@ class Flights:
         return [*(world for world in WORLDS if world in flown), *sorted(flown - set(WORLDS))]
 
 
+def _rule(injector: str, restart_s: float) -> str:
+    usual = restart_s == MissionConfig().node_restart_s
+    return ", ".join(filter(None, (injector, "" if usual else f"dead nodes {back(restart_s)}")))
+
+
+def back(restart_s: float) -> str:
+    """Return a restart rule in words, such as `back after 1 s`."""
+    never = restart_s >= LIMITS[_RESTART][1]
+    return "never back" if never else f"back after {restart_s:g} s"
+
+
 def _flown(table: pa.Table) -> pa.Table:
     table = tables.flown(table)
     usual_s = MissionConfig().node_restart_s
@@ -425,6 +452,10 @@ def _flown(table: pa.Table) -> pa.Table:
         lost=lost,
         ended=pc.is_valid(table["node_ended"]),
         restart_s=pa.array((config.get(_RESTART, usual_s) for config in configs), pa.float64()),
+        injector=pa.array(
+            [(config.get("instruction") or {}).get("compat") or "" for config in configs],
+            pa.string(),
+        ),
         repeats=pa.array(("companion" not in config for config in configs), pa.bool_()),
     )
 
@@ -443,7 +474,8 @@ def _as_paper(config: Mapping[str, Any]) -> bool:
         for name, value in (config.get(level) or {}).items()
         if value != _USUAL[level].get(name)
     }
-    return config.keys() <= _PAPER and changed <= _DRAWN and watch == PAPER
+    known = _PAPER | {_RESTART} if config.get("instruction") else _PAPER
+    return config.keys() <= known and changed <= _DRAWN and watch == PAPER
 
 
 def _beside_golden(table: pa.Table) -> pa.Table:

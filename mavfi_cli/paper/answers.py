@@ -15,7 +15,7 @@ from mavfi_cli.analysis.flights import COSTS
 from mavfi_cli.analysis.pairs import Balance, Fate, Flights
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.paper.items import BY_NAME, STACKS, printed_name, stack_of
+from mavfi_cli.paper.items import BY_NAME, STACKS, Regime, printed_name
 from mavfi_cli.paper.verdicts import ISOLATED, LEVEL, JudgedClaim, Judgement, Verdict
 from mavfi_cli.report.paper import DETECTOR_TITLES
 from mavfi_cli.stats.shares import Share, wilson
@@ -36,7 +36,7 @@ def judgement_of(judged: JudgedClaim, place: str, fate: Fate = Fate.ALL) -> Judg
     Return None if the claim was not judged there for faults of this fate.
 
     Args:
-        place: a stack, or a name from `place_of`.
+        place: name of a regime.
     """
     where = ISOLATED if judged.claim.isolated else place
     return judged.judgements.get(where, {}).get(fate)
@@ -187,7 +187,8 @@ def reason_of(judged: JudgedClaim, place: str) -> str:
     judgement = judgement_of(judged, place)
     if not judgement or judgement.verdict is not Verdict.CONTRADICTED or judgement.effect is None:
         return ""
-    explained = judged.claim.isolated or stack_of(place) == STACKS[0]
+    where = Regime.of(place)
+    explained = judged.claim.isolated or (where.stack == STACKS[0] and not where.rule)
     return words if explained and low <= judgement.effect.value <= high else ""
 
 
@@ -320,8 +321,9 @@ def protections(flights: Mapping[str, Flights]) -> list[Safeguard]:
         flights: flights by place, from `Evidence.by_place`.
     """
     name, first = next(iter(flights.items()))
-    own = [place for place in flights if stack_of(place) == stack_of(name)]
-    others = [place for place in flights if place not in own and stack_of(place) == STACKS[-1]]
+    usual = [place for place in flights if not Regime.of(place).rule]
+    own = [place for place in usual if Regime.of(place).stack == Regime.of(name).stack]
+    others = [place for place in usual if place not in own and Regime.of(place).stack == STACKS[-1]]
     safeguards = [
         Safeguard(
             name=f"{title} detector",

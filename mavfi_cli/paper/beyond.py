@@ -15,13 +15,12 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.analysis.pairs import Fate, Flights
+from mavfi_cli.analysis.pairs import Fate, Flights, back
 from mavfi_cli.campaigns.missions import Injected, canonical
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import BY_NAME, DType
-from mavfi_cli.paper.items import place_of, printed
+from mavfi_cli.paper.items import Regime, printed
 from mavfi_cli.report.paper import Printed
-from mavfi_cli.spec.mission import LIMITS
 from mavfi_cli.stats.paired import McNemar, holm
 from mavfi_cli.stats.shares import Share, cross_layer, wilson
 
@@ -355,7 +354,7 @@ def restarts(flights: Flights) -> list[RestartComparison]:
     if len(kinds) < 2:
         return [*_of_kind(flights)]
     return [
-        replace(row, place=place_of(row.place, kind))
+        replace(row, place=Regime(row.place, kind).name)
         for kind, mine in kinds.items()
         for row in _of_kind(mine)
     ]
@@ -364,8 +363,7 @@ def restarts(flights: Flights) -> list[RestartComparison]:
 def _of_kind(flights: Flights) -> Iterator[RestartComparison]:
     hit = flights.struck(level="instruction", own_lost=False)
     hit = hit.shared("stack", "world", arm="restart_s")
-    injectors = (json.loads(fault)[1].get("compat") or "" for fault in hit["fault"])
-    places = zip(hit["stack"], injectors, hit["world"], strict=True)
+    places = zip(hit["stack"], hit["injector"], hit["world"], strict=True)
     by_place = {place: mine.by("restart_s") for place, mine in hit.grouped(places).items()}
     for stack, injector in sorted({(stack, injector) for stack, injector, _ in by_place}):
         for world in hit.worlds:
@@ -377,7 +375,7 @@ def _of_kind(flights: Flights) -> Iterator[RestartComparison]:
 def _restarts(
     stack: str, world: str, rules: Mapping[tuple[float], Flights], golden: Flights
 ) -> RestartComparison:
-    flown = {_rule(delay_s): mine for (delay_s,), mine in sorted(rules.items(), key=itemgetter(0))}
+    flown = {back(delay_s): mine for (delay_s,), mine in sorted(rules.items(), key=itemgetter(0))}
     lost = [dict(zip(mine.faults, mine["lost"], strict=True)) for mine in flown.values()]
     first, last = ([not those[fault] for fault in sorted(lost[0])] for those in (lost[0], lost[-1]))
     return RestartComparison(
@@ -392,11 +390,6 @@ def _restarts(
         },
         p_value=McNemar.of(first, last).p_value,
     )
-
-
-def _rule(delay_s: float) -> str:
-    never = delay_s >= LIMITS["node_restart_s"][1]
-    return "never back" if never else f"back after {delay_s:g} s"
 
 
 # What faults cost a user's companion --------------------------------------------------------------

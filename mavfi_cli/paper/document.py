@@ -52,12 +52,10 @@ from mavfi_cli.paper.items import (
     ITEMS,
     LEFT_OUT,
     STACKS,
-    WORLDS,
     Item,
+    Regime,
     Source,
-    place_of,
     printed_name,
-    stack_of,
 )
 from mavfi_cli.paper.layouts import of_flights, of_kind
 from mavfi_cli.paper.sources import CampaignSource, Evidence
@@ -158,8 +156,7 @@ class Document:
     """The content of the results page.
 
     Attributes:
-        places: stacks, or a stack in each kind of worlds if the missions have both kinds. The page
-            shows the first one, and collapses the others.
+        places: names of regimes. The page shows the first one, and collapses the others.
         answers: for each place, a sentence on how far it reproduces the paper.
     """
 
@@ -204,7 +201,7 @@ class Document:
     @property
     def stack(self) -> str:
         """The stack of `place`."""
-        return stack_of(self.place)
+        return Regime.of(self.place).stack
 
     @property
     def answer(self) -> str:
@@ -239,7 +236,9 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         for place, mine in evidence.by_place(STACKS).items()
         if len(mine) or place != STACKS[1]  # the second rebuild is shown only if it was flown
     }
-    places = sorted(flown, key=lambda place: not len(flown[place]))
+    faulty = {place for place, mine in flown.items() if any(mine["level"])}
+    places = sorted(flown, key=lambda place: (place not in faulty, not len(flown[place])))
+    usual = [place for place in places if not Regime.of(place).rule]
     as_paper = {place: flown[place].chosen(as_paper=True) for place in places}
     flights = {place: those.chosen(at=(None, "random")) for place, those in as_paper.items()}
     kernels = evidence.isolated
@@ -268,7 +267,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         claims=claims,
         families=Family.of(claims),
         populations={place: those.population for place, those in flights.items() if len(those)},
-        forest=_forest(claims, places),
+        forest=_forest(claims, usual),
         disagreements=disagreements(claims, places[0]),
         protections=guards,
         advice=_advice(guards),
@@ -538,7 +537,11 @@ def _items(evidence: Evidence, flights: Mapping[str, Flights]) -> Iterator[_Show
         yield _ShownItem(
             item=item,
             parts=[part for part in parts.values() if part],
-            missing={p: _command(item, p) for p, part in parts.items() if part is None},
+            missing={
+                place: _command(item, place)
+                for place, part in parts.items()
+                if part is None and not Regime.of(place).rule
+            },
         )
 
 
@@ -546,9 +549,9 @@ def _command(item: Item, place: str) -> str:
     """Return the command that makes an item's part for a place."""
     if place == ISOLATED:
         return "mavfi kernels --runs 5000 --out kernels"
-    stack = stack_of(place)
-    many = " --worlds many" if place == place_of(stack, "many") else ""
-    return f"mavfi reproduce {item.name} --stack {stack}{many}"
+    where = Regime.of(place)
+    many = " --worlds many" if where.worlds == "many" else ""
+    return f"mavfi reproduce {item.name} --stack {where.stack}{many}"
 
 
 def _drawn(item: Item, place: str, table: PaperTable) -> _ItemPart:
@@ -557,7 +560,7 @@ def _drawn(item: Item, place: str, table: PaperTable) -> _ItemPart:
 
 
 def _flown(item: Item, place: str, flights: Flights, evidence: Evidence) -> _ItemPart | None:
-    mine = of_kind(item, stack_of(place), flights)
+    mine = of_kind(item, Regime.of(place).stack, flights)
     if not len(mine):
         return None
     table = of_flights(item.name, mine)
@@ -581,13 +584,13 @@ def _with_runs(item: Item, place: str, evidence: Evidence) -> Flights | None:
 
     Return None if no campaign kept them all.
     """
-    stack = stack_of(place)
+    where, nothing = Regime.of(place), Flights.pooled([])
     folders = (source for source in evidence.campaigns if source.may_have_runs)
-    several = (Flights.pooled([source.flights], stack) for source in folders)
-    if place != stack:
-        kind = next(kind for kind in WORLDS if place == place_of(stack, kind))
-        several = (flights.by_worlds.get(kind, Flights.pooled([])) for flights in several)
-    own = (of_kind(item, stack, flights) for flights in several)
+    several = (Flights.pooled([source.flights], where.stack) for source in folders)
+    if where.worlds:
+        several = (flights.by_worlds.get(where.worlds, nothing) for flights in several)
+    several = (flights.by_rules.get(where.rule, nothing) for flights in several)
+    own = (of_kind(item, where.stack, flights) for flights in several)
     return next((mine for mine in own if len(mine) and all(map(_is_kept, mine["path"]))), None)
 
 

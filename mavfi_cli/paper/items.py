@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
@@ -30,6 +30,35 @@ WORLDS = {"fixed": "fixed worlds", "many": "another world for each seed"}  # kin
 OUT, KERNELS_FOLDER = Path("reproduction"), "kernels"
 Key = str  # the configuration of a mission as text; equal missions have equal keys
 _ROMAN = ("", "I", "II", "III", "IV", "V", "VI", "VII")
+
+
+class Regime(NamedTuple):
+    """The flights that are judged together: a stack in one kind of worlds under one rule.
+
+    Attributes:
+        worlds: kind of worlds, a key of WORLDS; empty if only one kind was flown.
+        rule: injector and restart rule, a key of `Flights.by_rules`.
+    """
+
+    stack: str
+    worlds: str = ""
+    rule: str = ""
+
+    @classmethod
+    def of(cls, name: str) -> Regime:
+        """Return the regime with a name such as `mavbench, fixed worlds, dead nodes never back`."""
+        stack, *parts = name.split(_AND)
+        worlds = next((kind for kind, words in WORLDS.items() if words in parts), "")
+        rule = _AND.join(part for part in parts if part not in WORLDS.values())
+        return cls(stack, worlds, rule)
+
+    @property
+    def name(self) -> str:
+        """The regime in words."""
+        return _AND.join(filter(None, (self.stack, WORLDS.get(self.worlds), self.rule)))
+
+
+_AND = ", "
 
 
 class Source(Enum):
@@ -91,16 +120,6 @@ def printed_name(name: str) -> str:
     """Return the paper's name for a figure, table or section, such as `Fig. 6` for `fig6`."""
     kind, number = name.rstrip("0123456789"), int(name.lstrip("abcdefghijklmnopqrstuvwxyz"))
     return f"Fig. {number}" if kind == "fig" else f"{kind.capitalize()} {_ROMAN[number]}"
-
-
-def place_of(stack: str, worlds: str) -> str:
-    """Return the name of a stack in one kind of worlds, such as `mavbench, fixed worlds`."""
-    return f"{stack}, {WORLDS[worlds]}"
-
-
-def stack_of(place: str) -> str:
-    """Return the stack of a place, which is a stack or a name from `place_of`."""
-    return place.removesuffix(f", {WORLDS['fixed']}").removesuffix(f", {WORLDS['many']}")
 
 
 def printed(item: str, *keys: object) -> Printed:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from mavfi_cli.analysis.pairs import EVERY_STAGE, PERCENT, STAGES, Flights
-from mavfi_cli.campaigns.missions import changes_of, kind_of
+from mavfi_cli.campaigns.missions import Changes, changes_of, kind_of
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.run_folder import TRACE
@@ -49,23 +49,32 @@ def of_flights(name: str, flights: Flights) -> PaperTable:
     return replace(table, result=_RESULTS[name](table))
 
 
-_SEEDS = ("seed", "world_seed", "time_limit_s")
-
-
 def of_kind(item: Item, stack: str, flights: Flights) -> Flights:
-    """Select the flights that match a mission of the item on a stack in all settings except _SEEDS.
+    """Select the flights that match a mission of the item on a stack, apart from _APART.
 
     The result is empty if all of these flights are golden although the item needs faults.
+
+    Args:
+        flights: flights under one rule; see `Flights.by_rules`.
     """
     kinds = {
-        kind_of(changes_of(mission.config), _SEEDS)
+        _kind(changes_of(mission.config))
         for mission in FlightsPlan(items=[item], stack=stack).kinds()
     }
-    changes = map(json.loads, flights["changes"])
-    mine = flights.where([kind_of(change, _SEEDS) in kinds for change in changes])
+    mine = flights.where([_kind(json.loads(changes)) in kinds for changes in flights["changes"]])
     return (
         mine if any(mine["level"]) or item.name in _GOLDEN_ONLY else mine.where([False] * len(mine))
     )
+
+
+_APART = ("seed", "world_seed", "time_limit_s", "node_restart_s")
+
+
+def _kind(changes: Changes) -> str:
+    """Return the kind of a mission, without the injector of its fault."""
+    if (fault := changes.get("instruction")) is not None:
+        changes = {**changes, "instruction": {**fault, "compat": None}}
+    return kind_of(changes, _APART)
 
 
 _GOLDEN_ONLY = ("fig11",)

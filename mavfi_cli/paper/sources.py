@@ -21,7 +21,7 @@ from mavfi_cli.campaigns.specification_file import PRESETS, load_spec
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.files import file_digest, reading
 from mavfi_cli.core.installed import installed_versions, version_differences
-from mavfi_cli.paper.items import FlightsPlan, place_of
+from mavfi_cli.paper.items import FlightsPlan, Regime
 from mavfi_cli.paper.verdicts import Settling
 
 _EXPORT, _SPEC = ".parquet", ".toml"
@@ -141,23 +141,24 @@ class Evidence:
             for source in self.campaigns
             if source.settling is not None
             for stack in source.stacks
-            for place in (stack, *(place_of(stack, kind) for kind in source.flights.by_worlds))
+            for place in (stack, *(Regime(stack, kind).name for kind in source.flights.by_worlds))
         }
 
     def by_place(self, stacks: Sequence[str]) -> dict[str, Flights]:
-        """Return the flights of each stack, apart for each kind of worlds if it has both kinds.
+        """Return the flights of each stack and rule, apart for each kind of worlds if it has both.
 
-        The keys are stacks, or names from `place_of`. The intervals of a table with both kinds
-        would hold for neither.
+        The keys are names of regimes. The intervals of a table with both kinds of worlds would hold
+        for neither. A rule other than the usual one is omitted if no fault was flown under it.
         """
         places = dict[str, Flights]()
         for stack in stacks:
             flights = self.flights(stack)
             kinds = flights.by_worlds
-            if len(kinds) > 1:
-                places |= {place_of(stack, kind): mine for kind, mine in kinds.items()}
-            else:
-                places[stack] = flights
+            if len(kinds) < 2:
+                kinds = {"": flights}
+            for kind, those in kinds.items():
+                for rule, mine in those.by_rules.items():
+                    places[Regime(stack, kind, rule).name] = mine
         return places
 
     def flights(self, stack: str | None = None) -> Flights:
@@ -264,7 +265,8 @@ def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
 def _unpaired(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
     """Yield a sentence for each campaign with faulty flights that lack a golden flight.
 
-    Yield another one for each campaign in which no flight is like the paper's.
+    Yield another one for each campaign in which no flight is like the paper's. Flights of users'
+    companions are neither paired nor compared with the paper.
     """
     pooled = Flights.pooled([source.flights for source in campaigns])
     paired = {
@@ -273,14 +275,15 @@ def _unpaired(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
         if own is not None
     }
     for source in campaigns:
-        faulty = source.flights.chosen(level=("source", "instruction"))
+        repeated = source.flights.chosen(repeats=True)
+        faulty = repeated.chosen(level=("source", "instruction"))
         alone = sum(changes not in paired for changes in faulty["changes"])
         if alone:
             yield (
                 f"{source.path.name}: {alone:,} of {len(faulty):,} flights with a fault have no "
                 "golden flight of the same mission here, so they show no effect of the fault."
             )
-        if len(source.flights) and not any(source.flights["as_paper"]):
+        if len(repeated) and not any(repeated["as_paper"]):
             yield (
                 f"{source.path.name}: no flight is like the paper's (its vehicle, speed and "
                 "sensors, and one flip of drawn bits), so none judges a claim."

@@ -69,9 +69,15 @@ def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, Flights 
 
 
 def _of_export(item: Item, flights: Flights, path: Path) -> Flights:
-    """Select an item's flights from an export by their kinds, since an export has no plan."""
-    parts = [of_kind(item, stack, flights.chosen(stack=stack)) for stack in set(flights["stack"])]
-    flown = [part for part in parts if len(part)]
+    """Select an item's flights from an export by their kinds, since an export has no plan.
+
+    Of several rules, the first one of `Flights.by_rules` counts.
+    """
+    flown = []
+    for stack in set(flights["stack"]):
+        rules = flights.chosen(stack=stack).by_rules.values()
+        parts = (of_kind(item, stack, mine) for mine in rules)
+        flown += [part for part in parts if len(part)][:1]
     if len(flown) > 1:
         raise RecordError(
             f"{path}: contains flights for {item.paper} on several stacks; export each stack "

@@ -14,10 +14,7 @@ BY_WEIGHT = (
     "same interval"
 )
 
-UNPAIRED = (
-    "a user's companion: the fault repeats, but the flight only in lockstep, so settings are "
-    "compared unpaired"
-)
+UNPAIRED = "a user's companion: flights repeat only in lockstep, so settings are compared unpaired"
 
 
 class SettingRow(NamedTuple):

@@ -90,10 +90,13 @@ def test_what_is_not_of_the_paper_is_marked():
         row("planning", fault={"bits": 5, "field": "sign", "together": True}),
         row("planning", instruction=True),
         row("planning", instruction=True, fault={"roles": ("destination",)}),
+        row("planning", instruction=True, config={"node_restart_s": 3600.0}),
+        row("planning", config={"node_restart_s": 3600.0}),
+        row("planning", instruction=True, fault={"compat": "rosfi-2021"}),
     ]
     told = flights(rows)["as_paper"]
-    assert told == [True, False, False, True, True, False, True, True, False]
-    assert flights(rows)["at"][-6:-3] == ["random", "invocation=1", "random"]
+    assert told == [True, False, False, True, True, False, True, True, False, True, False, True]
+    assert flights(rows)["at"][3:6] == ["random", "invocation=1", "random"]
 
 
 def test_flights_are_chosen_by_their_columns():

@@ -9,14 +9,16 @@ import pytest
 from made_flights import Book, export_table, row
 
 from mavfi_cli.analysis.flights import exported
+from mavfi_cli.analysis.pairs import Fate
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.paper.document import document
-from mavfi_cli.paper.items import stack_of
+from mavfi_cli.paper.items import Regime
 from mavfi_cli.paper.sources import Evidence
 from mavfi_cli.report.campaign import flights_file
+from mavfi_cli.report.page import render
 
 KERNELS = Path(__file__).parents[2] / "docs/results/kernels.json"
 
@@ -228,7 +230,36 @@ def test_a_stack_is_split_by_kind_of_world_only_if_it_has_both(export):
     assert {place: len(flown) for place, flown in places.items()} == {
         "mavbench, fixed worlds": 1, "mavbench, another world for each seed": 1, "hardened": 1,
     }  # fmt: skip
-    assert [stack_of(place) for place in places] == ["mavbench", "mavbench", "hardened"]
+    assert [Regime.of(place).stack for place in places] == ["mavbench", "mavbench", "hardened"]
+
+
+def test_rules_of_restart_and_injector_are_judged_apart(export):
+    never, rosfi = {"node_restart_s": 3600.0}, {"compat": "rosfi-2021"}
+    table4 = {"time_limit_s": 400.0}
+    rows = [row(seed=seed, config=table4) for seed in range(1, 31)]
+    for seed in range(1, 31):
+        mine = {"seed": seed, "instruction": True}
+        rows += [
+            row("planning", **mine, config=table4),
+            row("planning", **mine, config={**table4, **never}, outcome="timeout"),
+            row("control", **mine, config={**table4, **never}, fault=rosfi),
+        ]
+    rows += [row("planning", seed=1, config={**table4, **never}, outcome="timeout")]  # of a state
+    found = Evidence.gather([export("one.parquet", *rows)])
+    names = ["", ", dead nodes never back", ", rosfi-2021, dead nodes never back"]
+    places = found.by_place(["mavbench"])
+    assert [*places] == [f"mavbench{name}" for name in names]
+    assert [len(flown) for flown in places.values()] == [61, 60, 60]  # with 30 golden each
+    shown = document(found)
+    claims = {each.claim.name: each.judgements for each in shown.claims}["table4-sparse"]
+    lost = [claims[place][Fate.ALL].effect.value for place in places]
+    assert lost == [0.0, 1.0, 0.0]
+    (table4,) = (each for each in shown.items if each.item.name == "table4")
+    assert [part.place for part in table4.parts] == [*places]
+    assert "hardened" in table4.missing
+    assert not any("never" in place for item in shown.items for place in item.missing)
+    assert [Regime.of(place).name for place in places] == [*places]
+    assert Regime.of("mavbench, fixed worlds, dead nodes never back").worlds == "fixed"
 
 
 def test_a_mission_that_could_not_begin_does_not_hide_its_flight(export):
@@ -275,3 +306,20 @@ def test_missions_of_another_paper_are_said_to_judge_nothing(export):
     rows = [row(seed=1, config=config), row("planning", seed=1, config=config)]
     found = Evidence.gather([export("slow.parquet", *rows)])
     assert any("slow.parquet: no flight" in x for x in found.problems)
+
+
+def test_a_page_of_users_companions_shows_nothing_of_the_paper(export):
+    config = {"companion": "fly.toml"}
+    mine = {"instruction": True, "config": config}
+    rows = [row(config=config), row("fly/server", **mine, outcome="crash")]
+    found = Evidence.gather([export("one.parquet", *rows)])
+    assert not any("golden" in problem or "paper" in problem for problem in found.problems)
+    page = render(document(found))
+    assert "fly/server" in page
+    assert "1 of 1, 100" in page
+    assert 'id="claims"' not in page
+    assert 'id="problems"' in page
+    both = Evidence.gather([export("two.parquet", *rows, row(seed=9))])
+    page = render(document(both))
+    assert 'id="claims"' in page
+    assert "fly/server" in page
