@@ -22,6 +22,7 @@ from collections.abc import Mapping
 import numpy as np
 from exported import PAIRED, Key, Row, flown, golden_lost, key, lost, share
 
+from mavfi_cli.paper.items import printed
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import holm, sign_flips
 from mavfi_cli.stats.shares import Interval
@@ -104,7 +105,11 @@ def main() -> None:
 
     print(f"\n| factor | {' | '.join(in_worlds[0])} |\n" + "|---" * (1 + len(in_worlds[0])) + "|")
     for name, by_world in zip(FACTORS, in_worlds, strict=True):
-        print(f"| {name} | {' | '.join(text(effect, '+') for effect in by_world.values())} |")
+        cells = (
+            f"{text(effect, '+')}, {effect.value / paper_points(world):.0%}"
+            for world, effect in by_world.items()
+        )
+        print(f"| {name} | {' | '.join(cells)} |")
 
     print("\n| " + " | ".join(names := ["worlds", "dead nodes", "injector"]) + " | lost | % |")
     print("|---" * 5 + "|")
@@ -121,6 +126,15 @@ def main() -> None:
         )))  # fmt: skip
         ends = [FACTORS[name][level] for name, level in zip(names, chosen, strict=True)]
         print(f"| {' | '.join(ends)} | {sum(hits)} of {len(hits)} | {text(rates, '')} |")
+
+
+def paper_points(world: str) -> float:
+    """Return the points of success that faults cost in a world of the paper's Table IV."""
+    golden, faulty = (
+        float(printed("table4", "success_percent", kind, world) or 0.0)
+        for kind in ("golden", "none")
+    )
+    return golden - faulty
 
 
 def of_seeds(values: Mapping[Key, float]) -> list[float]:
