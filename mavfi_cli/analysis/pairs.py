@@ -9,6 +9,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from enum import Enum
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -110,8 +111,9 @@ class Flights:
         ended: whether a node crashed or hung.
         restart_s: time after which a dead node is restarted.
         injector: the copied injector of a fault in an instruction, or an empty string.
-        repeats: whether the flight is repeatable. A flight of a user's companion is not, so it is
-            not paired with a golden flight.
+        companion: the file of a user's companion, and the autopilot if it is not mavfi's own; null
+            for mavfi's companion. A flight of a user's companion is not repeatable, so it is not
+            paired with a golden flight.
     Columns about the golden flight of the same mission:
         own_lost: whether the golden flight is lost; null without a golden flight.
         own_flight_time_s: golden flight time.
@@ -456,7 +458,7 @@ def _flown(table: pa.Table) -> pa.Table:
             [(config.get("instruction") or {}).get("compat") or "" for config in configs],
             pa.string(),
         ),
-        repeats=pa.array(("companion" not in config for config in configs), pa.bool_()),
+        companion=pa.array([*map(_companion, configs)], pa.string()),
     )
 
 
@@ -464,6 +466,13 @@ def _with_columns(table: pa.Table, **columns: Any) -> pa.Table:
     for name, column in columns.items():
         table = table.append_column(name, column)
     return table
+
+
+def _companion(config: Mapping[str, Any]) -> str | None:
+    if config.get("companion") is None:
+        return None
+    autopilot = config.get("autopilot")
+    return Path(config["companion"]).name + (f" on {autopilot}" if autopilot else "")
 
 
 def _as_paper(config: Mapping[str, Any]) -> bool:
@@ -483,7 +492,7 @@ def _beside_golden(table: pa.Table) -> pa.Table:
 
     The class `Flights` describes these columns.
     """
-    unprotected = pc.and_(pc.is_null(table["detector"]), table["repeats"])
+    unprotected = pc.and_(pc.is_null(table["detector"]), pc.is_null(table["companion"]))
     golden = pc.and_(unprotected, pc.equal(table["fault"], _NO_FAULT))
     own = _places(partners(table, table, ("pair",), only=golden))
     bare = _places(partners(table, table, ("pair", "fault"), only=unprotected))

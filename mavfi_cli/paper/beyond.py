@@ -428,9 +428,10 @@ def companion_arms(flights: Flights) -> list[CompanionArm]:
 
     Null faults, and faults that did not strike, are omitted.
     """
-    mine = flights.chosen(repeats=False, injected=(Injected.GOLDEN.value, *_HITS))
-    places = zip(mine["changes"], mine["fault_target"], mine["detector"], strict=True)
-    keys = [(_companion(changes), target or "", gate or "") for changes, target, gate in places]
+    mine = flights.chosen(injected=(Injected.GOLDEN.value, *_HITS))
+    mine = mine.where(name is not None for name in mine["companion"])
+    places = zip(mine["companion"], mine["fault_target"], mine["detector"], strict=True)
+    keys = [(companion, target or "", gate or "") for companion, target, gate in places]
     found = {
         (companion, target, gate): _companion_arm(companion, target, gate, those)
         for (companion, target, gate), those in mine.grouped(keys).items()
@@ -448,12 +449,6 @@ _HITS = (
     Injected.ACTIVE.value, Injected.UNREAD.value, Injected.CAUGHT.value,
     Injected.NOT_ACTIVATED.value,
 )  # fmt: skip
-
-
-def _companion(changes: str) -> str:
-    config = json.loads(changes)
-    autopilot = config.get("autopilot")
-    return Path(config["companion"]).name + (f" on {autopilot}" if autopilot else "")
 
 
 def _companion_arm(companion: str, target: str, gate: str, flights: Flights) -> CompanionArm:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import math
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -486,7 +485,6 @@ def _listed(
     path = source.path
     place = path.name if path.suffix and path.is_absolute() else str(path)
     run = [flight["path"]] if kept else [place, "--mission", str(flight["number"])]
-    repeats = "companion" not in json.loads(flight["changes"])
     return _ListedMission(
         number=flight["number"],
         fault=" + ".join(filter(None, (fault, flight["detector"]))),
@@ -494,7 +492,7 @@ def _listed(
         seed=flight["seed"],
         outcome=flight["outcome"],
         ratio=flight["over_own"],
-        command=shlex.join(["mavfi", "replay", *run]) if repeats else "",
+        command=shlex.join(["mavfi", "replay", *run]) if flight["companion"] is None else "",
         picture=_flight_picture(Path(flight["path"])) if kept and pictured else "",
     )
 

@@ -275,7 +275,7 @@ def _unpaired(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
         if own is not None
     }
     for source in campaigns:
-        repeated = source.flights.chosen(repeats=True)
+        repeated = source.flights.chosen(companion=None)
         faulty = repeated.chosen(level=("source", "instruction"))
         alone = sum(changes not in paired for changes in faulty["changes"])
         if alone:

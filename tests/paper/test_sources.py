@@ -323,3 +323,12 @@ def test_a_page_of_users_companions_shows_nothing_of_the_paper(export):
     page = render(document(both))
     assert 'id="claims"' in page
     assert "fly/server" in page
+
+
+@pytest.mark.parametrize("companion", [5, ["fly.toml"], {"a": 1}])
+def test_a_companion_that_is_no_name_is_damage(export, companion):
+    damaged = {"changes": json.dumps({"companion": companion})}
+    found = Evidence.gather([export("one.parquet", row(seed=1)),
+                             export("two.parquet", row(seed=1, **damaged))])  # fmt: skip
+    assert any("two.parquet: damaged" in problem for problem in found.problems)
+    assert len(found.campaigns) == 1
