@@ -17,7 +17,15 @@ from typing import Any
 
 from mavfi_cli.analysis.pairs import Fate, Flights
 from mavfi_cli.core.config import read_toml
-from mavfi_cli.paper.measures import MEASURES, NOT_FLOWN, OF_KERNELS, WITHOUT_FATES, Kernels
+from mavfi_cli.paper.items import Regime
+from mavfi_cli.paper.measures import (
+    MEASURES,
+    NOT_FLOWN,
+    OF_GOLDEN,
+    OF_KERNELS,
+    WITHOUT_FATES,
+    Kernels,
+)
 from mavfi_cli.paper.verdicts import (
     ISOLATED,
     Claim,
@@ -35,6 +43,9 @@ from mavfi_cli.stats.shares import Interval, wilson
 _FILE = Path(__file__).parent / "claims.toml"
 _FACTOR = 3.0  # effects from a third to three times a stated size reproduce it
 _NONE = {Fate.SILENT: "none of the faults is silent", Fate.DEAD: "none of the faults ends a node"}
+_GOLDEN = Judgement(
+    verdict=Verdict.NOT_DECIDABLE, why="it is about flights without a fault, on which no rule acts"
+)
 _WHOLE = ("points", "percent")  # units of shares, which are at most 1
 
 
@@ -46,9 +57,10 @@ def judged(
     """Return all claims with their verdicts, in the order of CLAIMS.
 
     Args:
-        flights: the flights on each stack, keyed by stack.
+        flights: the flights in each regime, keyed by its name. A claim about flights without a
+            fault is judged only where the rule is the usual one.
         kernels: summaries of the isolated kernels, keyed by name.
-        settled: for each stack, the record of the missions flown to settle claims; a stack without
+        settled: for each regime, the record of the missions flown to settle claims; one without
             such missions is omitted.
     """
     settled = settled or {}
@@ -60,14 +72,19 @@ def judged(
         nothing = Flights.pooled([])
         for claim, judgement in zip(alone, _judge(alone, nothing, kernels), strict=True):
             judgements[claim.name][ISOLATED] = {Fate.ALL: judgement}
-        for stack, those in flights.items():
+        for place, those in flights.items():
+            unruled = [claim for claim in flown if claim.golden and Regime.of(place).rule]
+            for claim in unruled:
+                judgements[claim.name][place] = {Fate.ALL: _GOLDEN}
             for fate in Fate:
-                applicable = [claim for claim in flown if fate in claim.fates]
+                applicable = [
+                    claim for claim in flown if fate in claim.fates and claim not in unruled
+                ]
                 verdicts = _judge(
-                    applicable, those.of_fate(fate), kernels, fate, settled.get(stack)
+                    applicable, those.of_fate(fate), kernels, fate, settled.get(place)
                 )
                 for claim, judgement in zip(applicable, verdicts, strict=True):
-                    cells = judgements[claim.name].setdefault(stack, {})
+                    cells = judgements[claim.name].setdefault(place, {})
                     if judgement.why == NOT_FLOWN.why != cells.get(Fate.ALL, judgement).why:
                         judgement = replace(judgement, why=_NONE[fate])
                     cells[fate] = judgement
@@ -132,6 +149,7 @@ def _read(path: Path) -> Iterator[Claim]:
             rule=rule,
             size=size,
             isolated=measure in OF_KERNELS,
+            golden=measure in OF_GOLDEN,
             fates=(Fate.ALL,) if measure in WITHOUT_FATES else tuple(Fate),
             **entry,
         )

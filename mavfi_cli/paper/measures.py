@@ -437,3 +437,5 @@ WITHOUT_FATES = OF_KERNELS | {
     "gaussian_dearer",
 }  # fmt: skip
 """The measures that do not depend on what a fault does to its node."""
+OF_GOLDEN = frozenset({"golden_success", "delta_range"})
+"""The measures of flights without a fault, which depend on no rule."""

@@ -99,6 +99,7 @@ class Claim:
         size: size of the effect in the paper; None if the paper does not state it.
         rule: the range and its origin, in words.
         isolated: whether the claim is about isolated kernels instead of flights.
+        golden: whether it is about flights without a fault.
         fates: fates of faults for which the claim is judged separately.
     """
 
@@ -116,6 +117,7 @@ class Claim:
     paper_tells: str = "drawn only, without counts"
     premise: str = ""
     isolated: bool = False
+    golden: bool = False
     fates: tuple[Fate, ...] = tuple(Fate)
 
 
@@ -124,7 +126,7 @@ class JudgedClaim:
     """A claim with its judgements on stacks or in isolated kernels.
 
     Attributes:
-        judgements: judgements by stack or ISOLATED, and then by the fate of the faults.
+        judgements: judgements by regime or ISOLATED, and then by the fate of the faults.
     """
 
     claim: Claim
@@ -134,7 +136,7 @@ class JudgedClaim:
         """Return the verdict at `place`, or None if the claim was not judged there.
 
         Args:
-            place: a stack or ISOLATED.
+            place: a regime or ISOLATED.
         """
         judgement = self.judgements.get(place, {}).get(fate)
         return None if judgement is None else judgement.verdict

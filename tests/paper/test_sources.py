@@ -254,6 +254,10 @@ def test_rules_of_restart_and_injector_are_judged_apart(export):
     claims = {each.claim.name: each.judgements for each in shown.claims}["table4-sparse"]
     lost = [claims[place][Fate.ALL].effect.value for place in places]
     assert lost == [0.0, 1.0, 0.0]
+    golden = {each.claim.name: each for each in shown.claims}["table4-golden-sparse"]
+    assert [golden.judgements[place][Fate.ALL].effect is None for place in places] == [
+        False, True, True,
+    ]  # fmt: skip
     (table4,) = (each for each in shown.items if each.item.name == "table4")
     assert [part.place for part in table4.parts] == [*places]
     assert "hardened" in table4.missing
