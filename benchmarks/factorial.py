@@ -28,7 +28,7 @@ from mavfi_cli.stats.paired import holm, sign_flips
 from mavfi_cli.stats.shares import Interval
 
 Cells = dict[tuple[bool, ...], list[bool]]  # whether each mission was lost, by levels
-PAPER_POINTS = 100.0 * (380 / 400 - 1058 / 1200)  # Table IV, all worlds: golden minus faults
+PAPER_LOSS = 100.0 * (380 / 400 - 1058 / 1200)  # Table IV, all worlds: golden minus faults
 FACTORS = {
     "worlds": ("one for each seed", "fixed"),
     "follower's rate": ("ours", "the release's"),
@@ -100,13 +100,13 @@ def main() -> None:
     for (name, ends), effect, p, p_seeds in rows:
         print(
             f"| {name} | {' | '.join(ends)} | {text(effect, '+')} | "
-            f"{effect.value / PAPER_POINTS:.0%} | {p:.2g} | {p_seeds:.2g} |"
+            f"{effect.value / PAPER_LOSS:.0%} | {p:.2g} | {p_seeds:.2g} |"
         )
 
     print(f"\n| factor | {' | '.join(in_worlds[0])} |\n" + "|---" * (1 + len(in_worlds[0])) + "|")
     for name, by_world in zip(FACTORS, in_worlds, strict=True):
         cells = (
-            f"{text(effect, '+')}, {effect.value / paper_points(world):.0%}"
+            f"{text(effect, '+')}, {effect.value / paper_loss(world):.0%}"
             for world, effect in by_world.items()
         )
         print(f"| {name} | {' | '.join(cells)} |")
@@ -128,12 +128,13 @@ def main() -> None:
         print(f"| {' | '.join(ends)} | {sum(hits)} of {len(hits)} | {text(rates, '')} |")
 
 
-def paper_points(world: str) -> float:
+def paper_loss(world: str) -> float:
     """Return the points of success that faults cost in a world of the paper's Table IV."""
     golden, faulty = (
-        float(printed("table4", "success_percent", kind, world) or 0.0)
-        for kind in ("golden", "none")
+        printed("table4", "success_percent", kind, world) for kind in ("golden", "none")
     )
+    assert isinstance(golden, float)
+    assert isinstance(faulty, float)
     return golden - faulty
 
 

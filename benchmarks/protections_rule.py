@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import collections
 import itertools
+import sys
 
 from exported import Key, Row, against, arguments, flown, key, lost, share_lost
 
@@ -62,15 +63,19 @@ def sign_test(one: dict[Key, bool], other: dict[Key, bool]) -> McNemar:
 def main() -> None:
     """Read the exports, and print the losses and the comparisons, each as a table."""
     rows = flown(arguments(__doc__).parse_args().parts)
-    healthy: dict[Key, bool] = {}
-    for row in rows:
-        if row["injected"] == "golden" and row["stack"] in (STACK, f"{STACK}:processes=[]"):
-            healthy[key(row, SCENE)] = healthy.get(key(row, SCENE), True) and not lost(row)
+    golden = [
+        {key(row, SCENE) for row in rows
+         if row["injected"] == "golden" and row["stack"] == stack and not lost(row)}
+        for stack in (STACK, f"{STACK}:processes=[]")
+    ]  # fmt: skip
+    healthy = set.intersection(*golden)
     arms: dict[str, dict[Key, Row]] = {name: {} for name in ARMS.values()}
     for row in filter(is_counted, rows):
-        if (name := arm_of(row)) and healthy.get(key(row, SCENE)):
+        if (name := arm_of(row)) and key(row, SCENE) in healthy:
             arms[name][key(row, FAULT)] = row
     shared = set.intersection(*(set(own) for own in arms.values()))
+    if not shared:
+        sys.exit("no fault was flown in every arm")
     worlds = sorted({fault[0] for fault in shared})
     print(f"{len(shared)} faults, {len({fault[2] for fault in shared})} seeds\n")
     print(f"| arm | {' | '.join(worlds)} | all |\n" + "|---" * (2 + len(worlds)) + "|")

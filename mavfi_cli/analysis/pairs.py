@@ -6,10 +6,11 @@ Items and claims select rows of this table and count the values in its columns.
 from __future__ import annotations
 
 import json
+import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from enum import Enum
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,11 +51,15 @@ _COLUMNS: Mapping[str, pa.DataType] = {
     ), pa.float64()),
     "counted": pa.bool_(),
 }  # fmt: skip
-_MOST_NAMED = 8  # worlds that a line lists
-_STRUCK = (Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT, Injected.NOT_ACTIVATED)
+_MOST_NAMED = 8  # worlds that a line lists, and rules that are judged
+STRUCK = (
+    Injected.ACTIVE.value, Injected.UNREAD.value, Injected.CAUGHT.value,
+    Injected.NOT_ACTIVATED.value,
+)  # fmt: skip
+"""The fates of faults that struck, as in the column `injected`."""
 _FAULTS = ("fault", "instruction")
 # A mission is one of the paper's if it differs from the defaults only in these, and its fault only
-# in _DRAWN. With a fault in an instruction, the restart delay may differ, too.
+# in _DRAWN. Unless its fault strikes a state, the restart delay may differ, too.
 _PAPER = {*_FAULTS, "detector", "isolate", "stack", "world", "seed", "world_seed", "planner",
           "platform", "time_limit_s"}  # fmt: skip
 _DRAWN = {"target", "seed", "field", "bits", "together", "at", "compat"}
@@ -104,16 +109,17 @@ class Flights:
         together: whether the fault strikes all components of a group at once.
         at: the trigger of a source-level fault; null without such a fault.
         as_paper: whether vehicle, speed, sensors, the single flip of random bits and the 13 watched
-            states are those of the paper. Stack, detector model and `at` may differ, and for faults
-            in instructions `restart_s` and `injector`.
+            states are those of the paper. Stack, detector model and `at` may differ. Unless a
+            fault strikes a state, `restart_s` and `injector` may differ, too.
         struck: whether the fault flipped a bit, read or not, as in the paper's counts.
         lost: whether the mission did not end in success.
         ended: whether a node crashed or hung.
-        restart_s: time after which a dead node is restarted.
+        restart_s: time after which a dead node is restarted; the default without a fault.
         injector: the copied injector of a fault in an instruction, or an empty string.
-        companion: the file of a user's companion, and the autopilot if it is not mavfi's own; null
-            for mavfi's companion. A flight of a user's companion is not repeatable, so it is not
-            paired with a golden flight.
+        companion: the file of a user's companion; null for mavfi's companion. Most flights of
+            users' companions are not repeatable, so none is paired with a golden flight.
+        mission: the mission's fields as text, without the restart delay if there is no fault; equal
+            missions have equal texts.
     Columns about the golden flight of the same mission:
         own_lost: whether the golden flight is lost; null without a golden flight.
         own_flight_time_s: golden flight time.
@@ -159,8 +165,8 @@ class Flights:
         whole = cls(pa.concat_tables([_NOTHING_FLOWN, *own]).combine_chunks())
         whole = whole if stack is None else whole.chosen(stack=stack)
         first: dict[str, int] = {}
-        for place, changes in enumerate(whole["changes"]):
-            first.setdefault(changes, place)
+        for place, mission in enumerate(whole["mission"]):
+            first.setdefault(mission, place)
         return cls(_beside_golden(whole.table.take(pa.array(first.values(), pa.int64()))))
 
     def without(self, left_out: Iterable[bool]) -> Flights:
@@ -288,13 +294,15 @@ class Flights:
         """The flights by injector and restart rule of their faults in instructions.
 
         The first key is an empty string: mavfi's own injector, and dead nodes that come back after
-        1 s. All other faults belong to it, and flights without a fault to every rule.
+        1 s. All other faults belong to it, and flights without a fault to every rule. Of the other
+        rules, only the _MOST_NAMED with the most faults are kept.
         """
         levels = zip(self["level"], self["injector"], self["restart_s"], strict=True)
         rules = [
             level and (_rule(*how) if level == "instruction" else "") for level, *how in levels
         ]
-        names = ["", *sorted({rule for rule in rules if rule})]
+        counts = Counter(rule for rule in sorted(filter(None, rules)))
+        names = ["", *sorted(name for name, _ in counts.most_common(_MOST_NAMED))]
         return {name: self.where(rule in (None, name) for rule in rules) for name in names}
 
     @property
@@ -436,9 +444,8 @@ def back(restart_s: float) -> str:
 
 def _flown(table: pa.Table) -> pa.Table:
     table = tables.flown(table)
-    usual_s = MissionConfig().node_restart_s
-    configs = [json.loads(changes) for changes in table["changes"].to_pylist()]
-    flips = pc.is_in(table["injected"], pa.array([fate.value for fate in _STRUCK]))
+    configs = [_checked(json.loads(changes)) for changes in table["changes"].to_pylist()]
+    flips = pc.is_in(table["injected"], pa.array(STRUCK))
     kills = pc.fill_null(pc.starts_with(table["fault_target"], "process."), _NO)
     lost = pc.fill_null(pc.not_equal(table["outcome"], Outcome.SUCCESS.value), _YES)
     faults = (canonical([config.get(name) for name in _FAULTS]) for config in configs)
@@ -453,26 +460,55 @@ def _flown(table: pa.Table) -> pa.Table:
         struck=pc.and_not(flips, kills),
         lost=lost,
         ended=pc.is_valid(table["node_ended"]),
-        restart_s=pa.array((config.get(_RESTART, usual_s) for config in configs), pa.float64()),
-        injector=pa.array(
-            [(config.get("instruction") or {}).get("compat") or "" for config in configs],
+        restart_s=pa.array(map(_restart_s, configs), pa.float64()),
+        injector=pa.array(map(_injector, configs), pa.string()),
+        companion=pa.array((config.get("companion") for config in configs), pa.string()),
+        mission=pa.array(
+            [
+                changes if _faulty(config) or _RESTART not in config
+                else canonical({name: config[name] for name in config if name != _RESTART})
+                for changes, config in zip(table["changes"].to_pylist(), configs, strict=True)
+            ],
             pa.string(),
         ),
-        companion=pa.array([*map(_companion, configs)], pa.string()),
-    )
+    )  # fmt: skip
+
+
+def _checked(config: Any) -> Mapping[str, Any]:
+    """Return a mission's fields if those that this module reads have values that it can use.
+
+    Raises:
+        ValueError: a fault or a detector is no table, an injector's name has other characters than
+            letters, digits, `_`, `.` and `-`, or a restart delay is not a number in its limits.
+    """
+    parts = [config.get(name) for name in (*_FAULTS, "detector")]
+    if not all(part is None or isinstance(part, dict) for part in parts):
+        raise ValueError("a fault or a detector is no table")
+    if not re.fullmatch(r"[\w.-]{0,40}", _injector(config), re.ASCII):
+        raise ValueError("the name of an injector is not allowed")
+    least, most = LIMITS[_RESTART]
+    if not least <= float(config.get(_RESTART, least)) <= most:
+        raise ValueError("a restart delay is outside its limits")
+    return dict(config)
+
+
+def _faulty(config: Mapping[str, Any]) -> bool:
+    return any(config.get(name) is not None for name in _FAULTS)
+
+
+def _restart_s(config: Mapping[str, Any]) -> float:
+    usual_s = MissionConfig().node_restart_s
+    return float(config.get(_RESTART, usual_s)) if _faulty(config) else usual_s
+
+
+def _injector(config: Mapping[str, Any]) -> str:
+    return (config.get("instruction") or {}).get("compat") or ""
 
 
 def _with_columns(table: pa.Table, **columns: Any) -> pa.Table:
     for name, column in columns.items():
         table = table.append_column(name, column)
     return table
-
-
-def _companion(config: Mapping[str, Any]) -> str | None:
-    if config.get("companion") is None:
-        return None
-    autopilot = config.get("autopilot")
-    return Path(config["companion"]).name + (f" on {autopilot}" if autopilot else "")
 
 
 def _as_paper(config: Mapping[str, Any]) -> bool:
@@ -483,7 +519,7 @@ def _as_paper(config: Mapping[str, Any]) -> bool:
         for name, value in (config.get(level) or {}).items()
         if value != _USUAL[level].get(name)
     }
-    known = _PAPER | {_RESTART} if config.get("instruction") else _PAPER
+    known = _PAPER if config.get("fault") else _PAPER | {_RESTART}
     return config.keys() <= known and changed <= _DRAWN and watch == PAPER
 
 
@@ -495,7 +531,8 @@ def _beside_golden(table: pa.Table) -> pa.Table:
     unprotected = pc.and_(pc.is_null(table["detector"]), pc.is_null(table["companion"]))
     golden = pc.and_(unprotected, pc.equal(table["fault"], _NO_FAULT))
     own = _places(partners(table, table, ("pair",), only=golden))
-    bare = _places(partners(table, table, ("pair", "fault"), only=unprotected))
+    fault = ("pair", "fault", "restart_s")
+    bare = _places(partners(table, table, fault, only=unprotected))
     own_lost, own_time = (table[name].take(own) for name in ("lost", "flight_time_s"))
     over_own, harmed = against_golden(own_lost, own_time, table["lost"], table["flight_time_s"])
     longer = pc.subtract(table["flight_time_s"], own_time)

@@ -10,17 +10,19 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from mavfi_cli.analysis.pairs import Fate, Flights, back
+from mavfi_cli.analysis.pairs import STRUCK, Fate, Flights, back
 from mavfi_cli.campaigns.missions import Injected, canonical
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import BY_NAME, DType
 from mavfi_cli.paper.items import Regime, printed
 from mavfi_cli.report.paper import Printed
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.paired import McNemar, holm
 from mavfi_cli.stats.shares import Share, cross_layer, wilson
 
@@ -351,16 +353,11 @@ def restarts(flights: Flights) -> list[RestartComparison]:
     worlds, and a copied injector apart from mavfi's own.
     """
     kinds = flights.by_worlds
-    if len(kinds) < 2:
-        return [*_of_kind(flights)]
-    return [
-        replace(row, place=Regime(row.place, kind).name)
-        for kind, mine in kinds.items()
-        for row in _of_kind(mine)
-    ]
+    kinds = kinds if len(kinds) > 1 else {"": flights}
+    return [row for kind, mine in kinds.items() for row in _of_kind(kind, mine)]
 
 
-def _of_kind(flights: Flights) -> Iterator[RestartComparison]:
+def _of_kind(kind: str, flights: Flights) -> Iterator[RestartComparison]:
     hit = flights.struck(level="instruction", own_lost=False)
     hit = hit.shared("stack", "world", arm="restart_s")
     places = zip(hit["stack"], hit["injector"], hit["world"], strict=True)
@@ -369,7 +366,7 @@ def _of_kind(flights: Flights) -> Iterator[RestartComparison]:
         for world in hit.worlds:
             if len(rules := by_place.get((stack, injector, world), {})) > 1:
                 row = _restarts(stack, world, rules, flights.golden)
-                yield replace(row, place=f"{stack}, {injector}") if injector else row
+                yield replace(row, place=Regime(stack, kind, injector).name)
 
 
 def _restarts(
@@ -399,14 +396,15 @@ def _restarts(
 class CompanionArm:
     """Flights of a user's companion with one kind of fault, without the gate or with it.
 
-    These flights are not repeatable, so arms are independent samples.
+    Most of these flights are not repeatable, so arms are compared as independent samples.
 
     Attributes:
-        companion: the companion's file, and the autopilot if it is not mavfi's own.
-        target: the struck process, message or field; empty for flights without a fault.
-        detector: the gate's detector; None without a gate.
+        companion: the companion's file, the autopilot if it is not mavfi's own, and the world.
+        fault: the struck process, message or field, and what else differs from the defaults; empty
+            for flights without a fault.
+        gate: the gate's detector, model and threshold; empty without a gate.
         lost: share of lost flights: of all, of the silent faults (read, and no process ended), and
-            of those that ended a process. Only that of all without a fault.
+            of those that ended a process. Without a fault, it has only the share of all.
         alarmed: share of flights in which the gate raised an alarm; None without a gate.
         hours: duration of all flights together.
         p_value: p-value of Fisher's exact test of all lost flights against those without a gate,
@@ -415,8 +413,8 @@ class CompanionArm:
     """
 
     companion: str
-    target: str
-    detector: str | None
+    fault: str
+    gate: str
     lost: Mapping[Fate, Share]
     alarmed: Share | None
     hours: float
@@ -428,40 +426,60 @@ def companion_arms(flights: Flights) -> list[CompanionArm]:
 
     Null faults, and faults that did not strike, are omitted.
     """
-    mine = flights.chosen(injected=(Injected.GOLDEN.value, *_HITS))
+    mine = flights.chosen(injected=(Injected.GOLDEN.value, *STRUCK))
     mine = mine.where(name is not None for name in mine["companion"])
-    places = zip(mine["companion"], mine["fault_target"], mine["detector"], strict=True)
-    keys = [(companion, target or "", gate or "") for companion, target, gate in places]
     found = {
-        (companion, target, gate): _companion_arm(companion, target, gate, those)
-        for (companion, target, gate), those in mine.grouped(keys).items()
+        key: _companion_arm(key, those)
+        for key, those in mine.grouped(map(_arm_key, mine["changes"])).items()
     }
     tested = {
-        (companion, target, gate): plain.lost[Fate.ALL].fisher(arm.lost[Fate.ALL])
-        for (companion, target, gate), arm in found.items()
-        if target and gate and (plain := found.get((companion, target, "")))
+        key: plain.lost[Fate.ALL].fisher(arm.lost[Fate.ALL])
+        for key, arm in found.items()
+        if key.fault and key.gate and (plain := found.get(key._replace(gate="")))
     }
     corrected = dict(zip(tested, holm([*tested.values()]), strict=True))
     return [replace(found[key], p_value=corrected.get(key)) for key in sorted(found)]
 
 
-_HITS = (
-    Injected.ACTIVE.value, Injected.UNREAD.value, Injected.CAUGHT.value,
-    Injected.NOT_ACTIVATED.value,
-)  # fmt: skip
+class _ArmKey(NamedTuple):
+    companion: str
+    fault: str
+    gate: str
 
 
-def _companion_arm(companion: str, target: str, gate: str, flights: Flights) -> CompanionArm:
+def _arm_key(changes: str) -> _ArmKey:
+    config = json.loads(changes)
+    fault = config.get("fault") or config.get("instruction") or {}
+    gate = config.get("detector") or {}
+    autopilot = f" on {config['autopilot']}" if config.get("autopilot") else ""
+    return _ArmKey(
+        companion=f"{config['companion']}{autopilot}, {config.get('world', _WORLD)}",
+        fault=", ".join(
+            [str(fault.get("target") or "")]
+            + [f"{name}={own}" for name, own in sorted(fault.items())
+               if name not in _DRAWN and own != _USUAL_FAULT.get(name)]
+        ) if fault else "",
+        gate=", ".join(str(gate[name]) for name in ("name", "model", "threshold")
+                       if gate.get(name) is not None),
+    )  # fmt: skip
+
+
+_WORLD = MissionConfig().world
+_DRAWN = ("target", "seed", "invocation_seed")
+_USUAL_FAULT: Mapping[str, Any] = json.loads(
+    canonical(asdict(FaultConfig(target="")) | asdict(InstructionConfig(target="")))
+)
+
+
+def _companion_arm(key: _ArmKey, flights: Flights) -> CompanionArm:
     alarms = [bool(count) for count in flights["alarm_count"]]
     fates = {Fate.ALL: flights}
-    if target:
+    if key.fault:
         fates[Fate.SILENT] = flights.chosen(ended=False, activation="read")
         fates[Fate.DEAD] = flights.chosen(ended=True)
     return CompanionArm(
-        companion=companion,
-        target=target,
-        detector=gate or None,
+        **key._asdict(),
         lost={fate: those.share() for fate, those in fates.items()},
-        alarmed=wilson(sum(alarms), len(alarms)) if gate else None,
+        alarmed=wilson(sum(alarms), len(alarms)) if key.gate else None,
         hours=float(flights.known("flight_time_s").sum()) / 3600.0,
     )

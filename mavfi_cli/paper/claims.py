@@ -44,7 +44,7 @@ _FILE = Path(__file__).parent / "claims.toml"
 _FACTOR = 3.0  # effects from a third to three times a stated size reproduce it
 _NONE = {Fate.SILENT: "none of the faults is silent", Fate.DEAD: "none of the faults ends a node"}
 _GOLDEN = Judgement(
-    verdict=Verdict.NOT_DECIDABLE, why="it is about flights without a fault, on which no rule acts"
+    verdict=Verdict.NOT_DECIDABLE, why="the rule does not affect flights without a fault"
 )
 _WHOLE = ("points", "percent")  # units of shares, which are at most 1
 
@@ -73,12 +73,13 @@ def judged(
         for claim, judgement in zip(alone, _judge(alone, nothing, kernels), strict=True):
             judgements[claim.name][ISOLATED] = {Fate.ALL: judgement}
         for place, those in flights.items():
-            unruled = [claim for claim in flown if claim.golden and Regime.of(place).rule]
-            for claim in unruled:
-                judgements[claim.name][place] = {Fate.ALL: _GOLDEN}
+            usual = not Regime.of(place).rule
+            for claim in flown:
+                if claim.golden and not usual:
+                    judgements[claim.name][place] = {Fate.ALL: _GOLDEN}
             for fate in Fate:
                 applicable = [
-                    claim for claim in flown if fate in claim.fates and claim not in unruled
+                    claim for claim in flown if fate in claim.fates and (usual or not claim.golden)
                 ]
                 verdicts = _judge(
                     applicable, those.of_fate(fate), kernels, fate, settled.get(place)

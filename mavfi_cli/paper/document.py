@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import math
 import shlex
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -156,6 +157,8 @@ class Document:
 
     Attributes:
         places: names of regimes. The page shows the first one, and collapses the others.
+        companions: for each campaign, the flights of users' companions.
+        only_companions: whether there is nothing else, so that the page leaves the paper out.
         answers: for each place, a sentence on how far it reproduces the paper.
     """
 
@@ -188,6 +191,7 @@ class Document:
     arm_pictures: Mapping[str, Picture]
     restarts: Sequence[RestartComparison]
     companions: Mapping[str, Sequence[CompanionArm]]
+    only_companions: bool
     sources: Sequence[CampaignSource]
     kernel_sources: Sequence[KernelSummary]
     missions: Sequence[_CampaignMissions]
@@ -196,11 +200,6 @@ class Document:
     def place(self) -> str:
         """The place whose verdicts are shown first: the paper's stack, or the first one flown."""
         return self.places[0]
-
-    @property
-    def stack(self) -> str:
-        """The stack of `place`."""
-        return Regime.of(self.place).stack
 
     @property
     def answer(self) -> str:
@@ -235,11 +234,12 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         for place, mine in evidence.by_place(STACKS).items()
         if len(mine) or place != STACKS[1]  # the second rebuild is shown only if it was flown
     }
-    faulty = {place for place, mine in flown.items() if any(mine["level"])}
-    places = sorted(flown, key=lambda place: (place not in faulty, not len(flown[place])))
-    usual = [place for place in places if not Regime.of(place).rule]
-    as_paper = {place: flown[place].chosen(as_paper=True) for place in places}
+    as_paper = {place: mine.chosen(as_paper=True) for place, mine in flown.items()}
     flights = {place: those.chosen(at=(None, "random")) for place, those in as_paper.items()}
+    faulty = {place for place, mine in flights.items() if any(mine["level"])}
+    places = sorted(flown, key=lambda place: (place not in faulty, not len(flights[place])))
+    as_paper, flights = ({place: those[place] for place in places} for those in (as_paper, flights))
+    usual = [place for place in places[1:] if not Regime.of(place).rule]
     kernels = evidence.isolated
     sdc = {name: kernel.outcomes["sdc"] for name, kernel in kernels.items()}
     silent = {name: (share.count, share.total) for name, share in sdc.items()}
@@ -248,11 +248,13 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
     step("counting what protects")
     maps = {place: state_map(as_paper[place]) for place in places}
     flows = {place: kernel_flows(flights[place], silent) for place in places}
-    by_arm = {
-        source.name: campaign_arms
+    names = Counter(source.name for source in evidence.campaigns)
+    named = {
+        source.name if names[source.name] == 1 else str(source.path): source.flights
         for source in evidence.campaigns
-        if (campaign_arms := arms(source.flights.comparable))
     }
+    by_arm = {name: found for name, mine in named.items() if (found := arms(mine.comparable))}
+    everything = evidence.flights()
     added = [*Delays.of(places[0], flights[places[0]])]
     guards = protections(flights)
     step("drawing the figures")
@@ -266,7 +268,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         claims=claims,
         families=Family.of(claims),
         populations={place: those.population for place, those in flights.items() if len(those)},
-        forest=_forest(claims, usual),
+        forest=_forest(claims, [places[0], *usual]),
         disagreements=disagreements(claims, places[0]),
         protections=guards,
         advice=_advice(guards),
@@ -284,12 +286,11 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         hourly={own: [*hourly_failures(flights[own], upsets_per_hour)] for own in places},
         arms=by_arm,
         arm_pictures={name: _arm_picture(name, mine) for name, mine in by_arm.items()},
-        restarts=restarts(evidence.flights().comparable),
+        restarts=restarts(everything.comparable),
         companions={
-            source.name: found
-            for source in evidence.campaigns
-            if (found := companion_arms(source.flights))
+            name: flown_arms for name, mine in named.items() if (flown_arms := companion_arms(mine))
         },
+        only_companions=not evidence.kernels and None not in everything["companion"],
         sources=evidence.campaigns,
         kernel_sources=evidence.kernels,
         missions=[*_missions(evidence.campaigns)],
@@ -315,7 +316,7 @@ def _extent(
     claims: Sequence[JudgedClaim],
 ) -> str:
     """State how many claims are judged, and from how many missions and runs."""
-    missions = sum(map(len, flights.values()))
+    missions = len({mission for mine in flights.values() for mission in mine["mission"]})
     runs = sum(kernel.runs for kernel in kernels.values())
     attacked = f" and {runs:,} runs of isolated kernels" if runs else ""
     places = (*flights, ISOLATED)

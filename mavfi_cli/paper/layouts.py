@@ -42,6 +42,7 @@ def of_flights(name: str, flights: Flights) -> PaperTable:
     rows = [*OF_FLIGHTS[name](flights)]
     notes = [
         flights.population,
+        *(f"rule of the faults in instructions: {rule}" for rule in _rules(flights)),
         *_unpaired(flights),
         *(_unknown_costs(flights) if name == "table5" else []),
     ]
@@ -49,9 +50,15 @@ def of_flights(name: str, flights: Flights) -> PaperTable:
     return replace(table, result=_RESULTS[name](table))
 
 
-def of_kind(item: Item, stack: str, flights: Flights) -> Flights:
-    """Select the flights that match a mission of the item on a stack, apart from _APART.
+def _rules(flights: Flights) -> list[str]:
+    """Return the names of the rules of the flights' faults, without the usual one."""
+    return [rule for rule, mine in flights.by_rules.items() if rule and any(mine["level"])]
 
+
+def of_kind(item: Item, stack: str, flights: Flights) -> Flights:
+    """Select the flights that match a mission of the item on a stack.
+
+    Seeds, the time limit, the injector and, unless a state is struck, the restart delay may differ.
     The result is empty if all of these flights are golden although the item needs faults.
 
     Args:
@@ -67,14 +74,14 @@ def of_kind(item: Item, stack: str, flights: Flights) -> Flights:
     )
 
 
-_APART = ("seed", "world_seed", "time_limit_s", "node_restart_s")
-
-
 def _kind(changes: Changes) -> str:
-    """Return the kind of a mission, without the injector of its fault."""
+    """Return the kind of a mission, without what may differ from an item's missions."""
+    apart = ["seed", "world_seed", "time_limit_s"]
+    if changes.get("fault") is None:
+        apart.append("node_restart_s")
     if (fault := changes.get("instruction")) is not None:
         changes = {**changes, "instruction": {**fault, "compat": None}}
-    return kind_of(changes, _APART)
+    return kind_of(changes, apart)
 
 
 _GOLDEN_ONLY = ("fig11",)

@@ -58,26 +58,40 @@ def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, Flights 
         return _settings_table(ledger) if plan is None else _progress_table(ledger, plan), None
     if item.source is not Source.FLIGHTS:
         return _unflown(item, ledger.folder.parent), None
-    table = Flights.of(flights(ledger))
+    table = Flights.pooled([Flights.of(flights(ledger))])
+    left_out: list[str] = []
     if plan is not None:
         mine = _flights_of(item, plan, table)
     elif ledger.export is None:
-        mine = table
+        mine, left_out = _of_one_rule(table)
     else:
-        mine = _of_export(item, table, ledger.folder)
-    return of_flights(item.name, mine), mine
+        mine, left_out = _of_export(item, table, ledger.folder)
+    layout = of_flights(item.name, mine)
+    notes = [f"not in this table: {rule}" for rule in left_out]
+    return replace(layout, notes=(*notes, *layout.notes)), mine
 
 
-def _of_export(item: Item, flights: Flights, path: Path) -> Flights:
+def _of_one_rule(flights: Flights) -> tuple[Flights, list[str]]:
+    """Return the flights under the first rule with a fault, and the names of the other rules.
+
+    `Flights.by_rules` gives the rules and their order.
+    """
+    rules = {rule or "the usual rule": mine for rule, mine in flights.by_rules.items()}
+    first, *others = [rule for rule, mine in rules.items() if any(mine["level"])] or [*rules]
+    return rules[first], others
+
+
+def _of_export(item: Item, flights: Flights, path: Path) -> tuple[Flights, list[str]]:
     """Select an item's flights from an export by their kinds, since an export has no plan.
 
-    Of several rules, the first one of `Flights.by_rules` counts.
+    Return them as `_of_one_rule` does.
     """
-    flown = []
-    for stack in set(flights["stack"]):
-        rules = flights.chosen(stack=stack).by_rules.values()
-        parts = (of_kind(item, stack, mine) for mine in rules)
-        flown += [part for part in parts if len(part)][:1]
+    parts = [
+        (of_kind(item, stack, mine), left_out)
+        for stack in sorted(set(flights["stack"]))
+        for mine, left_out in [_of_one_rule(flights.chosen(stack=stack))]
+    ]
+    flown = [part for part in parts if len(part[0])]
     if len(flown) > 1:
         raise RecordError(
             f"{path}: contains flights for {item.paper} on several stacks; export each stack "

@@ -14,7 +14,7 @@ BY_WEIGHT = (
     "same interval"
 )
 
-UNPAIRED = "a user's companion: flights repeat only in lockstep, so settings are compared unpaired"
+UNPAIRED = "a user's companion: its flights may not repeat, so settings are compared unpaired"
 
 
 class SettingRow(NamedTuple):

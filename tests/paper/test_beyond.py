@@ -194,27 +194,35 @@ def test_one_restart_rule_is_no_comparison():
 
 
 def test_a_users_companion_is_counted_with_and_without_its_gate():
-    config = {"companion": "fly.toml", "autopilot": "px4"}
+    config = {"companion": "my/fly.toml", "autopilot": "px4"}
     rows = [row(seed=1, config=config), row(seed=2, config=config, detector="gad", alarm_count=1)]
     for seed in range(1, 21):
         mine = {"seed": seed, "instruction": True, "config": config}
         rows += [row("fly/server", **mine, node_ended="killed by SIGSEGV", **LOST)]
         rows += [row("fly/server", **mine, detector="gad", alarm_count=seed % 2)]
         rows += [row("fly/other", **mine, detector="gad", **LOST)]
-    rows += [row("fly/server", seed=30, instruction=True, config=config, injected="null", **LOST)]
-    rows += [row(seed=40), row("planning", seed=40, **LOST)]  # not of a companion
-    found = {(arm.target, arm.detector): arm for arm in companion_arms(flights(rows))}
-    assert {arm.companion for arm in found.values()} == {"fly.toml on px4"}
+    message = "output.ATTITUDE_TARGET.thrust"
+    rows += [
+        row(message, config=config, fault={"persistence": "stuck-at", "duration_s": 5.0}, **LOST),
+        row(message, config=config),
+        row("fly/server", seed=30, instruction=True, config=config, injected="null", **LOST),
+        row(seed=40),  # not of a companion
+        row("planning", seed=40, **LOST),
+    ]
+    found = {(arm.fault, arm.gate): arm for arm in companion_arms(flights(rows))}
+    assert {arm.companion for arm in found.values()} == {"my/fly.toml on px4, sparse"}
     counts = {key: [each.counts for each in arm.lost.values()] for key, arm in found.items()}
     assert counts == {
-        ("", None): ["0 of 1"],
+        ("", ""): ["0 of 1"],
         ("", "gad"): ["0 of 1"],
         ("fly/other", "gad"): ["20 of 20", "20 of 20", "0 of 0"],
-        ("fly/server", None): ["20 of 20", "0 of 0", "20 of 20"],
+        ("fly/server", ""): ["20 of 20", "0 of 0", "20 of 20"],
         ("fly/server", "gad"): ["0 of 20", "0 of 20", "0 of 0"],
+        (message, ""): ["0 of 1", "0 of 1", "0 of 0"],
+        (f"{message}, duration_s=5.0, persistence=stuck-at", ""): ["1 of 1", "1 of 1", "0 of 0"],
     }
     assert found["", "gad"].alarmed.counts == "1 of 1"
     assert found["fly/server", "gad"].alarmed.counts == "10 of 20"
     assert found["fly/server", "gad"].p_value < 1e-9
-    assert found["fly/server", None].p_value is None
+    assert found["fly/server", ""].p_value is None
     assert found["fly/other", "gad"].p_value is None  # not flown without the gate

@@ -256,3 +256,21 @@ def test_an_item_of_two_stacks_is_refused(tmp_path):
         pytest.raises(RecordError, match=r"Table IV .*stacks"),
     ):
         shown(ledger, "table4")
+
+
+def test_an_item_is_shown_under_one_rule_which_its_notes_name(tmp_path):
+    never = {"world": "dense", "node_restart_s": 3600.0}
+    late = [
+        row("planning", instruction=True, seed=seed, config=never, outcome="timeout")
+        for seed in (1, 2)
+    ]
+    with exported(tmp_path, [in_dense(), *late]) as ledger:
+        table, flights = shown(ledger, "table4")
+    assert "rule of the faults in instructions: dead nodes never back" in table.notes
+    assert flights["level"].count("instruction") == 2
+    usual = in_dense("planning", instruction=True)
+    with exported(tmp_path, [in_dense(), row(config=never), usual, *late]) as ledger:
+        table, flights = shown(ledger, "table4")
+    assert "not in this table: dead nodes never back" in table.notes
+    assert not any(note.startswith("rule") for note in table.notes)
+    assert flights["level"] == [None, "instruction"]  # the golden flight counts once

@@ -266,6 +266,60 @@ def test_rules_of_restart_and_injector_are_judged_apart(export):
     assert Regime.of("mavbench, fixed worlds, dead nodes never back").worlds == "fixed"
 
 
+def test_a_detector_is_compared_with_the_same_fault_under_the_same_rule(export):
+    never = {"node_restart_s": 3600.0}
+    rows = [row(seed=seed) for seed in range(1, 31)]
+    for seed in range(1, 31):
+        mine = {"seed": seed, "instruction": True}
+        rows += [
+            row("planning", **mine),
+            row("planning", **mine, config=never, outcome="timeout"),
+            row("planning", **mine, config=never, detector="gad", outcome="timeout"),
+        ]
+    places = Evidence.gather([export("one.parquet", *rows)]).by_place(["mavbench"])
+    assert places["mavbench"].balance("gad").pairs == 0
+    found = places["mavbench, dead nodes never back"].balance("gad")
+    assert (found.pairs, found.before, found.undone, found.caused) == (30, 30, 0, 0)
+
+
+def test_a_golden_flight_with_two_restart_delays_counts_once(export):
+    never = {"node_restart_s": 3600.0}
+    rows = [row(), row(config=never), row("planning", instruction=True, config=never)]
+    found = Evidence.gather([export("one.parquet", *rows)])
+    assert len(found.flights()) == 2
+    shown = document(found)  # the golden flight of the fault has the delay, too
+    assert "2 missions judge" in shown.extent
+    assert shown.place == "mavbench, dead nodes never back"
+    assert "verdicts are those of: mavbench, dead nodes never back" in render(shown)
+
+
+def test_most_faults_decide_which_rules_are_judged(export):
+    rows = [row()] + [
+        row("planning", seed=seed, instruction=True, config={"node_restart_s": 2.0 + delay})
+        for delay in range(20)
+        for seed in range(1, 3 if delay == 17 else 2)
+    ]
+    rules = Evidence.gather([export("one.parquet", *rows)]).flights().by_rules
+    assert len(rules) == 9
+    assert "dead nodes back after 19 s" in rules
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"node_restart_s": None}, {"node_restart_s": float("nan")}, {"node_restart_s": -5.0},
+        {"instruction": {"compat": "fixed worlds"}}, {"instruction": {"compat": "$\\frac{$"}},
+        {"instruction": []}, {"fault": "x"}, {"detector": 1},
+    ],
+)  # fmt: skip
+def test_a_damaged_rule_is_damage(export, damage):
+    damaged = row("planning", instruction=True)
+    changes = json.loads(damaged["changes"]) | damage
+    damaged["changes"] = json.dumps(changes)
+    found = Evidence.gather([export("one.parquet", row()), export("two.parquet", damaged)])
+    assert any("two.parquet: damaged" in problem for problem in found.problems)
+
+
 def test_a_mission_that_could_not_begin_does_not_hide_its_flight(export):
     failed = {"state": "error", "outcome": None}
     places = [export("one.parquet", row(seed=1, **failed), row(seed=2)),
@@ -327,6 +381,23 @@ def test_a_page_of_users_companions_shows_nothing_of_the_paper(export):
     page = render(document(both))
     assert 'id="claims"' in page
     assert "fly/server" in page
+
+
+def test_flights_of_companions_do_not_choose_the_stack_of_the_page(export):
+    mine = {"instruction": True, "config": {"companion": "fly.toml", "stack": "mavbench"}}
+    replica = {"stack": "mavbench-replica"}
+    rows = [row("fly/server", **mine, outcome="crash"), row(config=replica)]
+    rows += [row("planning", instruction=True, config=replica)]
+    assert document(Evidence.gather([export("one.parquet", *rows)])).place == "mavbench-replica"
+
+
+def test_campaigns_of_one_name_stay_apart(export):
+    rows = {
+        name: row("fly/server", instruction=True, config={"companion": f"{name}.toml"})
+        for name in ("a", "b")
+    }
+    paths = [export(f"{name}/hop.parquet", own) for name, own in rows.items()]
+    assert [*document(Evidence.gather(paths)).companions] == [str(path) for path in paths]
 
 
 @pytest.mark.parametrize("companion", [5, ["fly.toml"], {"a": 1}])
