@@ -116,8 +116,8 @@ def crash_sentence(claims: Sequence[JudgedClaim], place: str, flights: Flights) 
     if yes:
         kept = yes.count(Verdict.REPRODUCED)
         parts.append(
-            f"Of the {len(yes)} reproduced claims about faults, {kept} {_are(kept)} also "
-            "reproduced by silent faults alone, which the paper studies."
+            f"{kept} of {len(yes)} reproduced claims about faults {_are(kept)} also reproduced by "
+            "silent faults alone, which the paper studies."
         )
     hit = flights.struck(level="instruction", platform=_COMPUTER).chosen(own_lost=False, lost=True)
     if len(hit):
