@@ -50,10 +50,9 @@ def is_counted(row: Row) -> bool:
 
 
 def sign_test(one: dict[Key, bool], other: dict[Key, bool]) -> McNemar:
-    """Return the exact sign test of two arms by seed: which of them loses more missions."""
-    both = one.keys() & other.keys()
+    """Return the exact sign test by seed of two arms with the same faults: which loses more."""
     more: collections.Counter[int] = collections.Counter()
-    for fault in both:
+    for fault in one:
         more[fault[SCENE.index("seed")]] += one[fault] - other[fault]
     # Each seed in which the arms differ is a pair whose two results differ.
     change = [*more.values()]

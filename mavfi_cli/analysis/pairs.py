@@ -63,9 +63,10 @@ _FAULTS = ("fault", "instruction")
 _PAPER = {*_FAULTS, "detector", "isolate", "stack", "world", "seed", "world_seed", "planner",
           "platform", "time_limit_s"}  # fmt: skip
 _DRAWN = {"target", "seed", "field", "bits", "together", "at", "compat"}
-_USUAL: Mapping[str, Any] = json.loads(canonical({
+USUAL: Mapping[str, Any] = json.loads(canonical({
     "fault": asdict(FaultConfig(target="")), "instruction": asdict(InstructionConfig(target="")),
 }))  # fmt: skip
+"""The default fields of a fault in a state and of one in an instruction."""
 _RESTART = "node_restart_s"
 _NO_FAULT = canonical([None] * len(_FAULTS))
 _NO, _YES = pa.scalar(False), pa.scalar(True)  # noqa: FBT003
@@ -517,7 +518,7 @@ def _as_paper(config: Mapping[str, Any]) -> bool:
         name
         for level in _FAULTS
         for name, value in (config.get(level) or {}).items()
-        if value != _USUAL[level].get(name)
+        if value != USUAL[level].get(name)
     }
     known = _PAPER if config.get("fault") else _PAPER | {_RESTART}
     return config.keys() <= known and changed <= _DRAWN and watch == PAPER

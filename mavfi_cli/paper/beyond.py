@@ -10,18 +10,17 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mavfi_cli.analysis.pairs import STRUCK, Fate, Flights, back
+from mavfi_cli.analysis.pairs import STRUCK, USUAL, Fate, Flights, back
 from mavfi_cli.campaigns.missions import Injected, canonical
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import BY_NAME, DType
 from mavfi_cli.paper.items import Regime, printed
 from mavfi_cli.report.paper import Printed
-from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.paired import McNemar, holm
 from mavfi_cli.stats.shares import Share, cross_layer, wilson
@@ -449,7 +448,8 @@ class _ArmKey(NamedTuple):
 
 def _arm_key(changes: str) -> _ArmKey:
     config = json.loads(changes)
-    fault = config.get("fault") or config.get("instruction") or {}
+    level = "fault" if config.get("fault") else "instruction"
+    fault = config.get(level) or {}
     gate = config.get("detector") or {}
     autopilot = f" on {config['autopilot']}" if config.get("autopilot") else ""
     return _ArmKey(
@@ -457,7 +457,7 @@ def _arm_key(changes: str) -> _ArmKey:
         fault=", ".join(
             [str(fault.get("target") or "")]
             + [f"{name}={own}" for name, own in sorted(fault.items())
-               if name not in _DRAWN and own != _USUAL_FAULT.get(name)]
+               if name not in _UNNAMED and own != USUAL[level].get(name)]
         ) if fault else "",
         gate=", ".join(str(gate[name]) for name in ("name", "model", "threshold")
                        if gate.get(name) is not None),
@@ -465,10 +465,7 @@ def _arm_key(changes: str) -> _ArmKey:
 
 
 _WORLD = MissionConfig().world
-_DRAWN = ("target", "seed", "invocation_seed")
-_USUAL_FAULT: Mapping[str, Any] = json.loads(
-    canonical(asdict(FaultConfig(target="")) | asdict(InstructionConfig(target="")))
-)
+_UNNAMED = ("target", "seed", "invocation_seed")  # fields of a fault that tell no kinds apart
 
 
 def _companion_arm(key: _ArmKey, flights: Flights) -> CompanionArm:
