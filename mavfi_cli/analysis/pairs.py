@@ -290,6 +290,17 @@ class Flights:
             if pc.any(pc.and_(kind, ours)).as_py()
         }
 
+    @staticmethod
+    def rule(injector: str | None, restart_s: float) -> str:
+        """Return an injector and a restart rule as a key of `by_rules`.
+
+        Args:
+            injector: the copied injector; None or an empty string for mavfi's own.
+            restart_s: time after which a dead node is restarted, s.
+        """
+        usual = restart_s == MissionConfig().node_restart_s
+        return ", ".join(filter(None, (injector, "" if usual else f"dead nodes {back(restart_s)}")))
+
     @property
     def by_rules(self) -> dict[str, Flights]:
         """The flights by injector and restart rule of their faults in instructions.
@@ -300,7 +311,7 @@ class Flights:
         """
         levels = zip(self["level"], self["injector"], self["restart_s"], strict=True)
         rules = [
-            level and (_rule(*how) if level == "instruction" else "") for level, *how in levels
+            level and (self.rule(*how) if level == "instruction" else "") for level, *how in levels
         ]
         counts = Counter(rule for rule in sorted(filter(None, rules)))
         names = ["", *sorted(name for name, _ in counts.most_common(_MOST_NAMED))]
@@ -430,11 +441,6 @@ class Flights:
         """The names of the worlds in which these flights took place, the paper's first."""
         flown = set(self["world"])
         return [*(world for world in WORLDS if world in flown), *sorted(flown - set(WORLDS))]
-
-
-def _rule(injector: str, restart_s: float) -> str:
-    usual = restart_s == MissionConfig().node_restart_s
-    return ", ".join(filter(None, (injector, "" if usual else f"dead nodes {back(restart_s)}")))
 
 
 def back(restart_s: float) -> str:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import click
 
 from mavfi_cli.cli.grouped import GroupedCommand, given_fields, option, refuse_given, section
-from mavfi_cli.cli.types import ABOVE_ZERO, ITEM, JOBS, OUT, STACK, UPSETS
+from mavfi_cli.cli.types import ABOVE_ZERO, COMPAT, ITEM, JOBS, OUT, STACK, UPSETS
 from mavfi_cli.core.option_types import Number, OutFile
 from mavfi_cli.core.terminal import echo, echo_lines, note
 
@@ -29,6 +29,12 @@ _output = section("Output")
 @_what("--worlds", type=click.Choice(["fixed", "many"]), default="fixed",
        help="Fly one fixed world of each environment, as the paper does, or another world for each "
             "seed.")  # fmt: skip
+@_what("--restart", "restart_s", type=Number(0.0, 3600.0), default=1.0,
+       help="Time until a node that died of a fault in an instruction works again, s; 3600 means "
+            "never.")  # fmt: skip
+@_what("--compat", type=COMPAT, metavar="INJECTOR",
+       help="Choose operands and bits of faults in instructions as another injector: pinfi, "
+            "pinfi-bugs, rosfi-2021.")  # fmt: skip
 @_what("--settle", is_flag=True,
        help="Then fly further missions where claims are undecided, until each is decided. Tests "
             "and intervals hold at any number of looks.")  # fmt: skip
@@ -44,7 +50,7 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
 
     ITEM is fig6 fig7 fig8 fig9 fig11 fig12 fig13 fig14 fig15 fig16 table3 table4 table5; all of
     them by default. Missions that items share are flown once. The same command resumes after an
-    interruption.
+    interruption. --restart and --compat select the items with faults in instructions.
     """
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.campaigns.specification import Keep
@@ -52,16 +58,14 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
     from mavfi_cli.core.files import plain
     from mavfi_cli.paper.flying import opened
     from mavfi_cli.paper.flying import reproduce as run
-    from mavfi_cli.paper.items import FlightsPlan, items_named
+    from mavfi_cli.paper.items import FlightsPlan
     from mavfi_cli.paper.settling import require_settleable, settle
     from mavfi_cli.paper.status import tables
     from mavfi_cli.spec.stack import load_stack
 
     load_stack(options["stack"])  # fail before the flights
-    plan = FlightsPlan(
-        items=items_named(names), stack=options["stack"], scale=options["scale"],
-        worlds=options["worlds"], out=options["out"],
-    )  # fmt: skip
+    plan = FlightsPlan(items=(), **given_fields(FlightsPlan, stack=options["stack"]))
+    plan = replace(plan, items=plan.named(names))
     if options["settle"]:
         require_settleable(plan)
     else:

@@ -25,7 +25,7 @@ from mavfi_cli.campaigns.run import PROFILES, Options, fly_missing, require_unch
 from mavfi_cli.campaigns.specification import SAMPLE, Keep
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.files import ScratchFolder
-from mavfi_cli.paper.items import ITEMS, KERNELS_FOLDER, FlightsPlan, Source
+from mavfi_cli.paper.items import KERNELS_FOLDER, FlightsPlan, Source
 from mavfi_cli.report.attacks import save_runs, summarise
 
 _UNMEASURED = 12  # largest number of missing missions that are not measured
@@ -90,7 +90,7 @@ def reproduce(
 
     Raises:
         ConfigError: the folder holds another campaign, or a reproduction that was begun with
-            another stack, other worlds, a larger scale or other program versions.
+            another stack, other worlds, another rule, a larger scale or other program versions.
         RecordError: the disk has too little free space.
         MavfiError: a mission or a kernel cannot be run.
     """
@@ -139,18 +139,18 @@ def opened(plan: FlightsPlan) -> Ledger:
 
     Raises:
         ConfigError: the folder holds another campaign, or was begun with another stack, other
-            worlds, a larger scale or other program versions.
+            worlds, another rule, a larger scale or other program versions.
     """
     if (plan.folder / LEDGER).is_file():
         with Ledger(plan.folder) as ledger:
             _require_same(plan, FlightsPlan.stored(ledger))
     else:
-        check_kinds(plan.kinds(*ITEMS))
+        check_kinds(plan.kinds(*plan.every))
     ledger = Ledger(plan.folder, writing=True)
     try:
         require_unchanged(ledger)
         ledger.set_meta(plan.meta)
-        store_plan(ledger, plan.missions(*ITEMS), append=True)
+        store_plan(ledger, plan.missions(*plan.every), append=True)
     except BaseException:
         ledger.close()
         raise
@@ -164,6 +164,9 @@ def _require_same(plan: FlightsPlan, stored: FlightsPlan | None) -> None:
         problem = f"holds a reproduction on the stack {stored.stack}, not {plan.stack}"
     elif stored.worlds != plan.worlds:
         problem = f"holds a reproduction with --worlds {stored.worlds}, not {plan.worlds}"
+    elif plan.rule != stored.rule:
+        rules = [own.rule or "the usual restart rule and injector" for own in (stored, plan)]
+        problem = "holds a reproduction under {}, not {}".format(*rules)
     elif plan.scale < stored.scale:
         problem = f"was begun with --scale {stored.scale:g}, which cannot shrink to {plan.scale:g}"
     else:

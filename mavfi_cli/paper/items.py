@@ -15,13 +15,15 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
-from mavfi_cli.campaigns.specification import Keep, Spec
+from mavfi_cli.campaigns.specification import Keep, Setting, Spec
 from mavfi_cli.campaigns.specification_file import folder_name, load_spec
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.report.paper import PaperColumn, PaperRow, PaperTable, Printed
+from mavfi_cli.spec.mission import MissionConfig
 
 _PAPER, _ = read_toml(Path(__file__).parent / "paper.toml")
 _META = "reproduction"  # key of the ledger's `meta`
@@ -183,6 +185,8 @@ class FlightsPlan:
     Attributes:
         scale: fraction of the paper's number of missions.
         worlds: `fixed` for one world per environment, or `many` for one per seed.
+        restart_s: after a fault in an instruction, time until a dead node is restarted, s.
+        compat: injector whose operands and bits faults in instructions have; None for mavfi's.
         out: folder of all reproductions; each stack has its own folder in it.
     """
 
@@ -190,6 +194,8 @@ class FlightsPlan:
     stack: str
     scale: float = 1.0
     worlds: str = "fixed"
+    restart_s: float = MissionConfig().node_restart_s
+    compat: str | None = None
     out: Path = OUT
 
     @classmethod
@@ -202,7 +208,43 @@ class FlightsPlan:
         if text is None:
             return None
         stored = {"worlds": "many", **json.loads(text)}  # older plans lack `worlds`
-        return cls(items=ITEMS, out=ledger.folder.parent, **stored)
+        plan = cls(items=ITEMS, out=ledger.folder.parent, **stored)
+        return replace(plan, items=plan.every)
+
+    @property
+    def rule(self) -> str:
+        """Injector and restart rule, as a key of `Flights.by_rules`; empty for the usual ones."""
+        return Flights.rule(self.compat, self.restart_s)
+
+    @property
+    def regime(self) -> Regime:
+        """The regime of the plan's flights, without their kind of worlds."""
+        return Regime(self.stack, rule=self.rule)
+
+    @property
+    def every(self) -> tuple[Item, ...]:
+        """All items of the paper, or those with faults in instructions if the plan has a rule."""
+        return tuple(item for item in ITEMS if not self.rule or self._strikes_instructions(item))
+
+    def named(self, names: Sequence[str]) -> tuple[Item, ...]:
+        """Return the named items in the order of ITEMS, or `every` item if no names are given.
+
+        Raises:
+            UnknownName: as `items_named`.
+            ConfigError: as `items_named`, or a named item has no flights to which the plan's
+                rule applies.
+        """
+        if not names:
+            return self.every
+        items = items_named(names)
+        for item in items:
+            if item not in self.every:
+                known = ", ".join(own.name for own in self.every)
+                raise ConfigError(
+                    "has no faults in instructions, so --restart and --compat do not apply; choose "
+                    f"from {known}", key=item.name,
+                )  # fmt: skip
+        return items
 
     @property
     def folder(self) -> Path:
@@ -213,6 +255,7 @@ class FlightsPlan:
     def meta(self) -> dict[str, str]:
         """The metadata that the campaign's ledger stores about the plan."""
         stored = {"stack": self.stack, "scale": self.scale, "worlds": self.worlds}
+        stored |= self._rule  # an older plan lacks it, as one with the usual rule does
         return {"name": self.folder.name, _META: json.dumps(stored)}
 
     @property
@@ -220,7 +263,9 @@ class FlightsPlan:
         """The command that flies all items on the plan's stack."""
         options = ("--stack", self.stack, "--scale", f"{self.scale:g}", "--worlds", self.worlds,
                    "--out", str(self.out))  # fmt: skip
-        return shlex.join(["mavfi", "reproduce", *options])
+        restart = ("--restart", f"{self.restart_s:g}") if "restart_s" in self._rule else ()
+        compat = ("--compat", self.compat) if self.compat else ()
+        return shlex.join(["mavfi", "reproduce", *options, *restart, *compat])
 
     def missions(self, *items: Item) -> list[PlannedMission]:
         """List the missions without duplicates, by repetition, so that all items grow together.
@@ -260,7 +305,7 @@ class FlightsPlan:
 
     def kept(self, ledger: Ledger) -> list[int]:
         """Return the numbers of the missions whose run folders must be kept for an item."""
-        specs = (spec for spec in self._specs(ITEMS, self.scale) if spec.keep is Keep.ALL)
+        specs = (spec for spec in self._specs(self.every, self.scale) if spec.keep is Keep.ALL)
         return _numbers_of(
             ledger, (key_of(mission) for spec in specs for mission in spec.missions())
         )
@@ -274,9 +319,32 @@ class FlightsPlan:
             replace(
                 spec if spec.fixed_world is None else spec.in_worlds(self.worlds),
                 fixed={**spec.fixed, "stack": self.stack},
+                settings=tuple(map(self._under_rule, spec.settings)),
             )
             for spec in specs
         ]
+
+    @property
+    def _rule(self) -> dict[str, Any]:
+        """The values of `restart_s` and `compat` that are not the usual ones."""
+        own = {"restart_s": self.restart_s, "compat": self.compat}
+        usual = FlightsPlan(items=(), stack=self.stack)
+        return {name: value for name, value in own.items() if value != getattr(usual, name)}
+
+    def _under_rule(self, setting: Setting) -> Setting:
+        if not _of_instructions(setting):
+            return setting
+        factors = {"restart_s": "node_restart_s", "compat": "compat"}
+        rule = {factors[name]: (value,) for name, value in self._rule.items()}
+        return replace(setting, axes={**setting.axes, **rule})
+
+    def _strikes_instructions(self, item: Item) -> bool:
+        settings = (own for spec in self._specs([item], 1.0) for own in spec.settings)
+        return bool(item.preset) and any(map(_of_instructions, settings))
+
+
+def _of_instructions(setting: Setting) -> bool:
+    return "instruction" in setting.axes.get("level", ())
 
 
 def _numbers_of(ledger: Ledger, keys: Iterable[Key]) -> list[int]:

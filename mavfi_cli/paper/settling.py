@@ -170,17 +170,17 @@ class _Look:
 
     def first(self, ledger: Ledger) -> dict[str, dict[str, FirstLook]]:
         """Return the first look at every claim that has an effect, keyed by claim name and fate."""
-        stack = self._plan.stack
+        place = self._plan.regime.name
         return {
             entry.claim.name: {
                 fate.value: FirstLook(
                     p=own.p_alone,
                     inside=entry.claim.low <= own.effect.value <= entry.claim.high,
                 )
-                for fate, own in entry.judgements.get(stack, {}).items()
+                for fate, own in entry.judgements.get(place, {}).items()
                 if own.effect is not None
             }
-            for entry in judged({stack: self._flown(flights(ledger))}, self._kernels)
+            for entry in judged({place: self._flown(flights(ledger))}, self._kernels)
         }
 
     def _flown(self, table: pa.Table) -> Flights:
@@ -193,15 +193,15 @@ class _Look:
 
         Claims of items that fly no missions are left out.
         """
-        stack = self._plan.stack
+        place = self._plan.regime.name
         table = flights(ledger)
         flown = self._flown(table)
-        verdicts = judged({stack: flown}, self._kernels, {stack: settling})
+        verdicts = judged({place: flown}, self._kernels, {place: settling})
         names = {item.name for item in self._plan.items}
         own = [
-            (entry.claim, entry.judgements[stack][Fate.ALL])
+            (entry.claim, entry.judgements[place][Fate.ALL])
             for entry in verdicts
-            if entry.claim.item in names and stack in entry.judgements
+            if entry.claim.item in names and place in entry.judgements
         ]
         self.judgements = {claim.name: judgement for claim, judgement in own}
         rows = zip(table["changes"].to_pylist(), table["wall_s"].to_pylist(), strict=True)

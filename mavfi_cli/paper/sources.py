@@ -134,14 +134,16 @@ class Evidence:
     def settled(self) -> Mapping[str, Settling]:
         """The missions flown to settle claims, by place, from the last campaign that has any.
 
-        A place has the names that `by_place` gives it, and the stack alone.
+        A place has the names that `by_place` gives it, and those without the kind of worlds.
         """
         return {
-            place: source.settling
+            Regime(stack, kind, rule).name: source.settling
             for source in self.campaigns
             if source.settling is not None
+            for rule, mine in source.flights.by_rules.items()
+            if any(mine["level"])
             for stack in source.stacks
-            for place in (stack, *(Regime(stack, kind).name for kind in source.flights.by_worlds))
+            for kind in ("", *source.flights.by_worlds)
         }
 
     def by_place(self, stacks: Sequence[str]) -> dict[str, Flights]:

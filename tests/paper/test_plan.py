@@ -1,5 +1,7 @@
 """The list of all items: complete, without repetition, and the same at the front when it grows."""
 
+from dataclasses import replace
+
 import pytest
 
 from mavfi_cli.campaigns.missions import canonical, changes_of
@@ -51,6 +53,24 @@ def test_another_stack_flies_the_same_missions():
     ours = missions(stack="hardened")
     assert {each.config.stack for each in ours} == {"hardened"}
     assert [each.config.seed for each in ours] == [each.config.seed for each in WHOLE]
+
+
+def test_a_rule_changes_faults_in_instructions_only():
+    plan = FlightsPlan(items=(), stack="mavbench", scale=SCALE, restart_s=5.0, compat="rosfi-2021")
+    assert plan.rule == "rosfi-2021, dead nodes back after 5 s"
+    flown = plan.missions(*plan.every)
+    usual = [own for own in missions(plan.every) if own.config.fault is None]
+    assert len(flown) == len(usual)
+    for own, other in zip(flown, usual, strict=True):
+        fault = other.config.instruction
+        if fault is None:
+            assert own.config == other.config
+        else:
+            fault = replace(fault, compat="rosfi-2021")
+            assert own.config == replace(other.config, instruction=fault, node_restart_s=5.0)
+    with pytest.raises(ConfigError, match=r"fig8: has no faults in instructions.* table4, table5"):
+        plan.named(["table4", "fig8"])
+    assert "--restart 5 --compat rosfi-2021" in plan.command
 
 
 def test_an_item_has_a_preset_or_another_source():

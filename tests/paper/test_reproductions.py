@@ -5,18 +5,23 @@ import os
 import shutil
 import signal
 from collections import namedtuple
+from dataclasses import replace
 
 import pyarrow.parquet as pq
 import pytest
 from made_flights import Book, export_table, row
 
+from mavfi_cli.analysis.pairs import Fate
 from mavfi_cli.campaigns.ledger import ExportedLedger, Ledger
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import PROFILES, Options, store_plan
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.paper import flying
+from mavfi_cli.paper.claims import judged
 from mavfi_cli.paper.items import FlightsPlan, items_named
-from mavfi_cli.paper.status import shown
+from mavfi_cli.paper.settling import settle
+from mavfi_cli.paper.sources import Evidence
+from mavfi_cli.paper.status import shown, tables
 
 pytestmark = pytest.mark.usefixtures("no_vehicle")
 TASK = Options(jobs=2, task="fake_task")
@@ -184,6 +189,29 @@ def test_each_stack_has_its_own_folder(copied, tmp_path):
     copied.folder.rename(other.folder)
     with pytest.raises(ConfigError, match="stack mavbench, not mavbench:guards_tracking=true"):
         flown(other)
+
+
+@pytest.mark.slow
+def test_a_rule_is_kept_reported_and_settled(tmp_path):
+    never = replace(plan(tmp_path, "table4"), restart_s=3600.0)
+    assert flown(never).missions == len(never.missions()) == 4 * 2 * (1 + 3 * 3)
+    with Ledger(never.folder) as ledger:
+        stored = FlightsPlan.stored(ledger)
+        assert (stored.rule, stored.items) == ("dead nodes never back", never.every)
+        assert len(shown(ledger, "table4")[1]) == len(never.missions())
+    with pytest.raises(ConfigError, match="under dead nodes never back, not the usual restart"):
+        flown(plan(tmp_path, "table4"))
+    (table,) = tables(never)
+    assert [line.count for line in table.rows[:2]] == ["2", "6"]
+    with flying.opened(never) as ledger:
+        settle(never, ledger, TASK, Spectator(), 1e-9)  # too short a time: it flies nothing
+    evidence = Evidence.gather([tmp_path])
+    regime = "mavbench, dead nodes never back"
+    assert evidence.settled.keys() == {regime, "mavbench, fixed worlds, dead nodes never back"}
+    claims = judged(evidence.by_place(["mavbench"]), {}, evidence.settled)
+    (line,) = {entry.judgements[regime][Fate.ALL].history for entry in claims
+               if entry.claim.item == "table4" and not entry.claim.golden}  # fmt: skip
+    assert line
 
 
 def test_another_campaign_is_refused(tmp_path):
