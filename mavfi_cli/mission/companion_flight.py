@@ -114,8 +114,8 @@ class CompanionFlight:
         if detector is None:
             return None
 
-        def note(text: str) -> None:
-            self.logger.note(self.stamp_s, "alarm", text, self.telemetry.state)
+        def note(kind: str, text: str) -> None:
+            self.logger.note(self.stamp_s, kind, text, self.telemetry.state)
 
         return SetpointGate(
             detector, self._companion.gate, self._companion.mark, note=note,

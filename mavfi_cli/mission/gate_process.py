@@ -115,7 +115,8 @@ class _Worker:
         """Make the gate in this process, because a worker must soon give a sign of life."""
         process = self._process
         self._gate = SetpointGate(
-            process.detector, process.settings, process.mark, note=self.tell,
+            process.detector, process.settings, process.mark,
+            note=lambda _kind, text: self.tell(text),
             signing=signing_from_file(process.key_file), gone=_Watch(process.process).gone,
         )  # fmt: skip
 

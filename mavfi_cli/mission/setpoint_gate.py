@@ -48,7 +48,7 @@ class SetpointGate:
 
     Args:
         mark: Companion for which the detector's model must have been made; None allows any.
-        note: Called with one line of text per event.
+        note: Called with kind and text of each event: `program` for a second sender, else `alarm`.
         signing: Key of the link, for signing replacement setpoints and the gate's own messages.
         gone: Returns why the companion's process is gone; empty while it runs.
         speed: Seconds of `now_s` per second of the wall clock, by which companions send heartbeats.
@@ -69,7 +69,7 @@ class SetpointGate:
         settings: GateConfig,
         mark: StackMark | None,
         *,
-        note: Callable[[str], None],
+        note: Callable[[str, str], None],
         signing: Signing | None = None,
         gone: Callable[[], str] = str,
         speed: float = 1.0,
@@ -129,7 +129,7 @@ class SetpointGate:
 
     def _judge(self, message: Message, now_s: float) -> list[Message]:
         if text := self._commanders.another(message):
-            self._say(text, math.inf)
+            self._say(text, math.inf, "program")
         if why := self._staleness(message, now_s):
             self._counts.stale += 1
             if self._settings.watch_only:
@@ -250,7 +250,7 @@ class SetpointGate:
         self._say(f"setpoint {doing}: {blamed}: {alarm.detector} {alarm.score:.3g}", now_s)
         self._withheld = action != "none"
 
-    def _say(self, text: str, now_s: float) -> bool:
+    def _say(self, text: str, now_s: float, kind: str = "alarm") -> bool:
         """Note an event, and send it as STATUSTEXT.
 
         Return False, and do nothing, within 1 s of the last event.
@@ -258,7 +258,7 @@ class SetpointGate:
         if now_s - self._noted_s < _TEXT_EVERY_S:
             return False
         self._noted_s = now_s if math.isfinite(now_s) else self._noted_s
-        self._note(text)
+        self._note(kind, text)
         self._codec.system = self._view.telemetry.system or 1
         data = f"mavfi gate: {text}".encode("ascii", "replace")
         for message in text_messages(dialect.MAV_SEVERITY_WARNING, data, self._checks % 65535 + 1):

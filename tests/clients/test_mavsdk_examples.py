@@ -22,8 +22,15 @@ pytestmark = [
 ]
 
 
+@pytest.fixture(params=["ours", "px4"])
+def autopilot(request):
+    if request.param == "px4" and not os.environ.get("PX4_SITL"):
+        pytest.skip("PX4_SITL names no PX4")
+    return request.param
+
+
 @pytest.fixture(params=["velocity-ned", "velocity-body", "position-ned", "attitude"])
-def example(request, tmp_path):
+def example(request, tmp_path, autopilot):
     """Flies an example with the file of its campaign, but without the corridor."""
     name = f"offboard_{request.param.replace('-', '_')}.py"
     place = tmp_path / "MAVSDK-Python" / "examples" / name
@@ -37,6 +44,7 @@ def example(request, tmp_path):
     def fly(**fault):
         flown = library.fly(
             companion=str(path),
+            autopilot=autopilot,
             world="farm",
             world_seed=3,
             time_limit_s=90.0,

@@ -317,7 +317,7 @@ def test_a_gate_judges_any_frame_and_passes_only_frames_that_decode(hostile: lis
     """It would fail open or closed for good if its detector or its view of the vehicle raised."""
     notes: list[str] = []
     detector, closed = DetectorConfig(name="gad", any_stack=True), GateConfig(on_error="closed")
-    gate = SetpointGate(detector, closed, None, note=notes.append)
+    gate = SetpointGate(detector, closed, None, note=lambda kind, text: notes.append(text))
     codec = Codec(0, 0, keeps_unknown=True)
     for number, (frame, side) in enumerate(hostile):
         for message in codec.decode(frame):

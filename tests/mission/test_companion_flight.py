@@ -178,8 +178,8 @@ def test_a_vehicle_with_a_key_obeys_only_a_companion_that_signs(fly, tmp_path, s
 def test_another_commander_is_told_once(fly, gated):
     second = f"[program.second]\ncommand = '{sys.executable} {HOP} {{link}} {SPEED} lands 190'\n"
     run = fly("lands", program=second, gated=gated)
-    texts = [event.text for event in run.record.events]
-    assert sum("sends setpoints" in text for text in texts) == 1
+    kinds = [event.kind for event in run.record.events if "sends setpoints" in event.text]
+    assert kinds == ["program"]
 
 
 @pytest.mark.slow

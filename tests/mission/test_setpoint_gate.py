@@ -102,7 +102,12 @@ def gate(model):
         notes = []
         detector = DetectorConfig(name="range", model=str(model))
         made = SetpointGate(
-            detector, GateConfig(**settings), mark, note=notes.append, gone=gone, signing=signing
+            detector,
+            GateConfig(**settings),
+            mark,
+            note=lambda kind, text: notes.append(text),
+            gone=gone,
+            signing=signing,
         )
         made.said = notes
         for message in states(1000):
@@ -137,7 +142,7 @@ def test_a_wild_setpoint_is_held_back_then_braked_and_a_good_one_passes(gate):
 def test_a_standstill_keeps_the_yaw_of_the_last_accepted_setpoint(model):
     own = SetpointGate(
         DetectorConfig(name="range", model=str(model)), GateConfig(action="brake"), MARK,
-        note=lambda text: None,
+        note=print,
     )  # fmt: skip
     for message in states(1000):  # the vehicle faces north
         own.pass_between(message, Side.AUTOPILOT, 1.0)
@@ -169,7 +174,7 @@ def test_a_plug_in_judges_setpoints(monkeypatch):
     entry = EntryPoint("steps", f"{__name__}:Steps", PLUG_INS.group)
     monkeypatch.setattr(installed, "entry_points", lambda group: EntryPoints([entry]))
     monkeypatch.setattr(base, "PLUG_INS", installed.PlugIns(PLUG_INS.group, "detector"))
-    own = SetpointGate(DetectorConfig(name="steps"), GateConfig(), MARK, note=lambda text: None)
+    own = SetpointGate(DetectorConfig(name="steps"), GateConfig(), MARK, note=print)
     for message in states(1000):
         own.pass_between(message, Side.AUTOPILOT, 1.0)
     assert velocities(own, [2.0, 2.0, -1000.0, 2.0]) == [[2.0], [2.0], [2.0], [2.0]]
