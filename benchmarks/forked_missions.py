@@ -4,9 +4,9 @@
 
 The missions of one seed are golden and protected flights, faults in states of every stage with all
 persistences, faults in the detector, and ends of processes. With `--instruction`, the faults are in
-instructions of every node instead. `--short` makes the flights 10 m long. Every file of every run
-folder is compared, except the host section of the result and the measured time of a stop in a fault
-record.
+instructions of every node instead. Each seed flies one of the STACKS. `--short` makes the flights
+10 m long. Every file of every run folder is compared, except the host section of the result and the
+measured time of a stop in a fault record.
 """
 
 from __future__ import annotations
@@ -32,6 +32,15 @@ from mavfi_cli.spec.mission import MissionConfig
 WORLDS = ("sparse", "dense", "factory", "farm")
 STATES = ("perception", "planning", "control")
 PROCESSES = ("process.octomap", "process.planner", "process.control")
+STACKS = (
+    "hardened",
+    "mavbench",
+    "mavbench:restores_counters=true",
+    "mavbench:processes=[],restores_counters=true",
+    'mavbench:standby=["planner"]',
+    'mavbench:processes=[],standby=["collision_check"]',
+    "mavbench-replica:restores_counters=true",
+)
 NODES = ("point_cloud", "octomap", "collision_check", "planner", "control")
 
 
@@ -41,12 +50,13 @@ SHORT: dict[str, Any] = {"world": "farm", "start": (2.0, 2.0, 0.0), "goal": (10.
 def missions(instruction: bool, short: bool) -> Iterator[PlannedMission]:
     """Yield planned missions without end, seed by seed."""
     for seed in itertools.count(1):
-        stack = "mavbench" if seed % 2 else "hardened"
+        stack = STACKS[seed % len(STACKS)]
         base = MissionConfig(world=WORLDS[seed % len(WORLDS)], seed=seed, stack=stack)
         base = replace(base, **SHORT) if short else base
         restart_s = (0.1, 1.0)[seed % 2]
         for name in (None, "gad", "aad"):
-            guarded = replace(base, detector=None if name is None else DetectorConfig(name=name))
+            detector = None if name is None else DetectorConfig(name=name, any_stack=True)
+            guarded = replace(base, detector=detector)
             yield PlannedMission(config=guarded)
             if instruction:
                 for node, fault in itertools.product(NODES, (seed, seed + 1000)):

@@ -23,6 +23,7 @@ from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingState
 from mavfi_cli.companion.executor import Executor, LatencyModel, Node, TurnOver
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.kernels import ControlInput, Kernels
+from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Recovery, Response
 from mavfi_cli.core.types import (
     Briefing,
@@ -149,9 +150,10 @@ class Companion:
             Node("collision_check", kernels.collision_check, on_start=self._check_starts)
         )
         self._planner = add(Node("planner", kernels.planner, on_restart=self._planner_is_up))
+        self._fresh = kernels  # with which a lost process restarts
         if stack.restores_counters:
-            self._collision_check.before_restart = lambda: kernels.restore_check(self.report)
-            self._planner.before_restart = lambda: kernels.restore_planner(self.plans)
+            self._collision_check.before_restart = lambda: self._fresh.restore_check(self.report)
+            self._planner.before_restart = lambda: self._fresh.restore_planner(self.plans)
         self._control = add(Node("control", kernels.control, on_restart=self._control_is_up))
         for nodes in stack.processes:
             self.executor.share_process(nodes)
@@ -170,6 +172,15 @@ class Companion:
         self.plans: list[Trajectory] = []
         self.plan_failures: Counter[str] = Counter()
         self.reactions: list[Reaction] = []
+
+    def isolate_late(self, name: str, fresh: Companion, process: NodeProcess | None = None) -> None:
+        """Move a node that has already run to its own process, as `Executor.isolate_late` does.
+
+        Args:
+            fresh: A companion that has never run. If the process is lost, its kernels take over.
+        """
+        self.executor.isolate_late(name, fresh.executor.process_of(name), process)
+        self._fresh = fresh._fresh
 
     # Perception
 

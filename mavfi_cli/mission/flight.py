@@ -236,9 +236,8 @@ class Flight:
         fresh = Companion(
             self._config, self._parts, self._briefing, WallClock(), NoInjection(), NoProtection()
         )
-        executor = self.companion.executor
-        executor.isolate_late(name, fresh.executor.process_of(name), process)
-        return executor
+        self.companion.isolate_late(name, fresh, process)
+        return self.companion.executor
 
     def _shortest_flight_s(self, briefing: Briefing) -> float:
         """Return a lower bound, in seconds, on the flight time from take-over to the goal."""

@@ -101,6 +101,26 @@ def test_a_forked_mission_is_that_flown_alone(missions, flown_alone, tmp_path):
     assert forked == len(missions) - 1  # one is left for a job
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["restores_counters=true", 'standby=["planner"]'])
+def test_a_fork_restarts_or_replaces_a_lost_node_as_the_mission_flown_alone(variant, tmp_path):
+    fault = FaultConfig(target="process.planner", at="time=18")  # between two plans
+    base = MissionConfig(world="dense", seed=3, stack=f"mavbench:{variant}", time_limit_s=90.0)
+    missions = [
+        PlannedMission(config=replace(base, fault=fault, node_restart_s=after_s))
+        for after_s in (0.5, 1.0)
+    ]
+    flown = {}
+    for whole in (False, True):
+        options = Options(jobs=1, keep=Keep.ALL, whole=whole)
+        with run_campaign(missions, tmp_path / str(whole), options) as ledger:
+            flown[whole] = list(ledger.results())
+    for row, alone in zip(flown[False], flown[True], strict=True):
+        files, host = files_of(row.path)
+        assert files == files_of(alone.path)[0], row.number
+        assert "forked_s" in host
+
+
 STRUCK = {  # the faults of each stack, by the effect on the node
     "hardened": {
         "masked": {"target": "octomap", "seed": 1},
