@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -11,26 +10,9 @@ from typing import Any
 
 import click
 
-from mavfi_cli.core.option_types import Number
+from mavfi_cli.core.option_types import Number, Place
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "show_default": True}
-Triple = tuple[float, ...]
-
-
-class Place(click.ParamType[Triple]):
-    """Option type for three comma-separated numbers, such as east, north and up in metres."""
-
-    name = "x,y,z"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> Triple:
-        """Return the three finite numbers in `value`, or fail with a usage error."""
-        try:
-            place = tuple(float(part) for part in str(value).split(","))
-        except ValueError:
-            place = ()
-        if len(place) != 3 or not all(math.isfinite(c) for c in place):
-            self.fail(f"must be x,y,z in m, such as 30,40,5, got {value!r}", param, ctx)
-        return place
 
 
 class _Size(click.ParamType[tuple[int, int]]):

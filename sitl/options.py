@@ -9,9 +9,9 @@ from typing import Any
 
 import click
 
-from mavfi_cli.core.option_types import OutFolder
+from mavfi_cli.core.option_types import Coordinates, OutFolder
 from sitl.autopilot.telemetry import Preset
-from sitl.command_line import CONTEXT, POSITIVE, Triple, camera_options, signing, world_and_vehicle
+from sitl.command_line import CONTEXT, POSITIVE, camera_options, signing, world_and_vehicle
 
 _FIRMWARE_LINK = "udpin:127.0.0.1:14540"  # where externally started firmware sends
 # Like PX4 SITL: UDP to the companion's and ground station's ports, a TCP server for any client.
@@ -59,8 +59,8 @@ class VehicleSetup:
 
     world: str = "dense"
     seed: int = 3
-    start_enu_m: Triple | None = None
-    goal_enu_m: Triple | None = None
+    start_enu_m: Coordinates | None = None
+    goal_enu_m: Coordinates | None = None
     vehicle: str = "solo"
     camera_size: tuple[int, int] = (64, 48)
     camera_rate_hz: float = 10.0

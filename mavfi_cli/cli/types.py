@@ -16,7 +16,7 @@ from click.shell_completion import CompletionItem
 
 from mavfi_cli.cli.grouped import names_in
 from mavfi_cli.core.compiled import PACKAGE
-from mavfi_cli.core.option_types import Number, OutFolder
+from mavfi_cli.core.option_types import Number, OutFolder, Place
 
 # Numbers ------------------------------------------------------------------------------------------
 
@@ -31,25 +31,7 @@ CONFIDENCE = Number(0.0, 1.0, min_open=True, max_open=True)
 SHARE, SCALE = Number(0.0, 1.0), Number(0.0, 1000.0, min_open=True)
 NUMBER = click.IntRange(0, MISSIONS.max)  # of a mission in its campaign
 UPSETS = Number(0.0, 1.0e12)
-
-
-Vector3 = tuple[float, float, float]
-
-
-class _Place(click.ParamType[Vector3]):
-    """The type of an option that takes coordinates X,Y,Z (east, north, up) in metres."""
-
-    name = "text"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> Vector3:
-        try:
-            x, y, z = (float(part) for part in value.split(","))
-        except ValueError:
-            self.fail(f"must be three numbers such as 30,40,5, got {value!r}", param, ctx)
-        return x, y, z
-
-
-PLACE = _Place()
+PLACE = Place()
 
 # Names --------------------------------------------------------------------------------------------
 

@@ -1,7 +1,8 @@
-"""Types of command-line options: bounded numbers, and files and folders that a command writes."""
+"""Types of command-line options: numbers, coordinates, and files and folders to write."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,25 @@ class Number(click.FloatRange):
         """Convert the value as click does, and fail if it is NaN."""
         number = float(super().convert(value, param, ctx))
         return self.fail(f"{value} is not a number.", param, ctx) if number != number else number
+
+
+Coordinates = tuple[float, float, float]
+
+
+class Place(click.ParamType[Coordinates]):
+    """The type of an option that takes three finite numbers, such as east, north and up in m."""
+
+    name = "x,y,z"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Coordinates:
+        """Return the three numbers, or fail if they are not three finite numbers."""
+        try:
+            x, y, z = (float(part) for part in str(value).split(","))
+        except ValueError:
+            x = y = z = math.nan
+        if not all(map(math.isfinite, (x, y, z))):
+            self.fail(f"must be three finite numbers such as 30,40,5, got {value!r}", param, ctx)
+        return x, y, z
 
 
 class _OutPath(click.Path):

@@ -12,7 +12,7 @@ import click
 import numpy as np
 
 from mavfi_cli.core.errors import LinkLost
-from mavfi_cli.core.option_types import OutFolder
+from mavfi_cli.core.option_types import Coordinates, OutFolder, Place
 from mavfi_cli.core.terminal import exit_code, note
 from mavfi_cli.link.transport import signing_from_file
 from sitl.camera.component import Camera
@@ -20,8 +20,6 @@ from sitl.camera.station import PoseTracker, Station, Witness
 from sitl.camera.stream import DepthStream
 from sitl.command_line import (
     CONTEXT,
-    Place,
-    Triple,
     camera_options,
     signing,
     stop_on_signals,
@@ -58,13 +56,13 @@ from sitl.world import load_world
 @signing
 def _camera(
     *,
-    origin: Triple | None,
+    origin: Coordinates | None,
     links: Sequence[str],
     camera_size: tuple[int, int],
     camera_rate_hz: float,
     camera_heartbeat_hz: float,
     hfov_deg: float,
-    mount: Triple | None,
+    mount: Coordinates | None,
     vehicle: str,
     truth: Path | None,
     depth: Path | None,
@@ -72,8 +70,8 @@ def _camera(
     allow_unsigned: bool,
     world: str,
     seed: int,
-    start_enu_m: Triple | None,
-    goal_enu_m: Triple | None,
+    start_enu_m: Coordinates | None,
+    goal_enu_m: Coordinates | None,
 ) -> None:
     """Run depth camera and referee for an autopilot without a world, such as PX4 or ArduPilot SITL.
 

@@ -13,9 +13,9 @@ from typing import Any
 import click
 
 from mavfi_cli.core.files import require_output, write_atomically, write_text
-from mavfi_cli.core.option_types import OutFile
+from mavfi_cli.core.option_types import Coordinates, OutFile
 from mavfi_cli.core.terminal import echo, exit_code
-from sitl.command_line import CONTEXT, Triple, complete_world, places
+from sitl.command_line import CONTEXT, complete_world, places
 from sitl.world.plan import DEFAULT_CLEARANCE_M, check_world, world_svg
 from sitl.world.world import World, format_place, load_world, named_worlds
 
@@ -28,7 +28,12 @@ def _on_world(command: Callable[..., None]) -> Callable[..., Any]:
     @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
     @functools.wraps(command)
     def with_world(
-        *, name: str, seed: int, start_enu_m: Triple | None, goal_enu_m: Triple | None, **given: Any
+        *,
+        name: str,
+        seed: int,
+        start_enu_m: Coordinates | None,
+        goal_enu_m: Coordinates | None,
+        **given: Any,
     ) -> None:
         world = load_world(name, seed=seed, start_enu_m=start_enu_m, goal_enu_m=goal_enu_m)
         command(world, **given)
