@@ -15,6 +15,11 @@ from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 EXAMPLES = os.environ.get("MAVSDK_EXAMPLES")
+OPEN = """name = "open"
+bounds_enu_m = [-200.0, -200.0, 0.0, 200.0, 200.0, 50.0]
+start_enu_m = [0.0, 0.0, 0.0]
+goal_enu_m = [0.0, 40.0, 5.0]
+"""
 
 pytestmark = [
     pytest.mark.slow,
@@ -41,12 +46,14 @@ def example(request, tmp_path, autopilot):
     path = tmp_path / "first.toml"
     path.write_text("\n".join(lines[:-2]) + "\n")
 
+    world = tmp_path / "open.toml"  # on PX4, the paths meet the hedges of farm
+    world.write_text(OPEN)
+
     def fly(**fault):
         flown = library.fly(
             companion=str(path),
             autopilot=autopilot,
-            world="farm",
-            world_seed=3,
+            world=str(world),
             time_limit_s=90.0,
             out=tmp_path,
             **fault,
