@@ -24,7 +24,7 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.shares import CrossLayer, Share, cross_layer
 
-_STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
+_STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value, Injected.NULL.value}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -209,6 +209,14 @@ class Ledger:
         if memory:
             return sqlite3.connect(":memory:", isolation_level=None)
         mode = "rwc" if self._writing else "rw"  # a reader of a WAL file writes its index
+        places = (self._path, self._path.parent)
+        if not self._writing and not all(os.access(place, os.W_OK) for place in places):
+            log = self._path.with_name(f"{LEDGER}-wal")
+            if log.is_file() and log.stat().st_size:
+                raise ConfigError(
+                    "is read-only, and its run has not ended; read a copy of it", path=self.folder
+                )
+            mode = "ro&immutable=1"
         uri = f"{self._path.absolute().as_uri()}?mode={mode}"
         connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=30.0)
         if self._writing:

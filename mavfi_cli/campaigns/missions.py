@@ -225,9 +225,9 @@ def _caught(flight: FlightRecord) -> bool:
     )
 
 
-# Fates of the missions that count: no fault, or a fault that could affect the mission's success.
+# Fates of the missions that count: no fault, a null fault, or one that could affect the success.
 COUNTED = frozenset(
-    fate.value for fate in (Injected.GOLDEN, Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT)
+    fate.value for fate in Injected if fate not in (Injected.NOT_ACTIVATED, Injected.NOT_INJECTED)
 )
 
 

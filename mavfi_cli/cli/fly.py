@@ -113,8 +113,8 @@ _detector, _output = section("Detector"), section("Output")
              "process.NODE (kills the node's process). With --companion: MESSAGE.FIELD, MESSAGE or "
              "process.PROGRAM.")  # fmt: skip
 @_fault("--stage", "direction", type=click.Choice(["output", "input"]),
-        help="Direction of a MAVLink message with --companion: from the companion, or to it  "
-             "[both].")  # fmt: skip
+        help="With --companion: strike messages that the companion sends (output) or receives "
+             "(input)  [both].")  # fmt: skip
 @_fault("--at", default="random", metavar="random|time=S|tick=N|phase=NAME|foreseen|invocation=N",
         help="Trigger. Time and ticks count from when the companion takes control.")  # fmt: skip
 @_fault("--fault-seed", default=1, type=types.SEED, help="Seed of all random draws of the fault.")

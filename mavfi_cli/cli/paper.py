@@ -96,7 +96,14 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
 @click.command(cls=GroupedCommand)
 @click.argument("places", nargs=-1, required=True, metavar="DIR...",
                 type=click.Path(path_type=Path))  # fmt: skip
-@option("-o", "--output", required=True, metavar="FILE", help="HTML file to write.", type=OutFile())
+@option(
+    "-o",
+    "--output",
+    required=True,
+    metavar="FILE",
+    help="HTML file to write.",
+    type=OutFile((".html", ".htm")),
+)
 @option("--upsets", type=UPSETS, default=1.0,
         help="Bit flips per hour that reach the injection sites, for the table of failures per "
              "flight hour.")  # fmt: skip
@@ -134,5 +141,6 @@ def report(places: tuple[Path, ...], output: Path, upsets: float, as_json: bool)
                    "problems": [*evidence.problems]}  # fmt: skip
         echo(json.dumps(summary, indent=2))
     else:
-        echo(content.answer)
+        if not content.only_companions:
+            echo(content.answer)
         echo(f"{missions:,} missions in {output} ({size / 1e6:.1f} MB)")

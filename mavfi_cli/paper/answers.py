@@ -92,8 +92,10 @@ def answer(claims: Sequence[JudgedClaim], place: str) -> str:
     begin += ", as far as it is decided" if open_ and bool(yes) is not bool(no) else ""
     if yes + no < max(open_, _DECIDED * len(claims)):
         begin = "Not known yet"
+    judged = yes + no + open_
+    claims_are = "claim that is" if judged == 1 else "claims that are"
     return (
-        f"{begin}: of the {yes + no + open_} claims that are judged, {yes} {_are(yes)} reproduced, "
+        f"{begin}: of the {judged} {claims_are} judged, {yes} {_are(yes)} reproduced, "
         f"{no} {_are(no)} contradicted, and {open_} {_are(open_)} undecided at this number of "
         "missions."
     )

@@ -304,7 +304,8 @@ def _advice(guards: Sequence[Safeguard]) -> str:
         effects = {guard.name: cell.effect for guard in guards if (cell := guard.against[kind])}
         helping = [name for name, effect in effects.items() if effect == "helps"]
         if helping:
-            sentences.append(f"Against {kind}, this helps: {' and '.join(helping)}.")
+            helps = "helps" if len(helping) == 1 else "help"
+            sentences.append(f"Against {kind}, {' and '.join(helping)} {helps}.")
         elif {*effects.values()} - {"nothing to undo"}:
             sentences.append(f"Against {kind}, nothing flown here is proven to help.")
     return " ".join(sentences)
@@ -324,7 +325,10 @@ def _extent(
         any(claim.verdict(place) not in (None, Verdict.NOT_DECIDABLE) for place in places)
         for claim in claims
     )
-    return f"{missions:,} missions{attacked} judge {count} of {len(claims)} claims."
+    return (
+        f"{missions:,} missions{attacked} judge {count} of {len(claims)} claims in one regime at "
+        "least."
+    )
 
 
 # Pictures of answers ------------------------------------------------------------------------------

@@ -51,19 +51,19 @@ def test_faults_that_did_nothing_are_counted_apart(book):
         outcome = "collision" if injected is ACTIVE else "success"
         book.add(FI, seed, 20.0 + seed, injected=injected, outcome=outcome)
     (cell,) = summary(book.ledger).cells
-    assert (cell.success.count, cell.success.total) == (2, 3)
-    assert (cell.inactive.count, cell.inactive.total) == (3, 3)
+    assert (cell.success.count, cell.success.total) == (3, 4)  # the null fault is a control
+    assert (cell.inactive.count, cell.inactive.total) == (2, 2)
     assert (cell.every.count, cell.every.total) == (5, 6)
     assert cell.injected == {fate.value: 1 for fate in sorted(fates, key=lambda f: f.value)}
-    assert cell.metrics["flight_time_s"].value == 23.0  # unread, caught
-    assert cell.metrics["flight_time_s"].count == 2
+    assert cell.metrics["flight_time_s"].value == pytest.approx(70.0 / 3.0)  # unread, null, caught
+    assert cell.metrics["flight_time_s"].count == 3
     told = CampaignReport.of(book.ledger).lines()
     row = told[1]
-    assert "  2/3  " in row
+    assert "  3/4  " in row
     assert "  83.3 %  " in row  # of all six, as the paper counts
-    assert row.endswith("  3")
+    assert row.endswith("  2")
     assert told[3].endswith("  ended otherwise")
-    assert told[4].endswith("  collision 1, not activated 1, not injected 1, null 1")
+    assert told[4].endswith("  collision 1, not activated 1, not injected 1")
 
 
 def test_a_campaign_that_was_killed_before_it_had_a_list_has_no_row(book):

@@ -106,6 +106,20 @@ def test_a_reader_changes_nothing(tmp_path):
         reader.add(0, **ROW)
 
 
+def test_a_ledger_that_cannot_be_written_is_read(tmp_path, monkeypatch):
+    with written(tmp_path) as ledger:
+        planned_missions = ledger.planned()
+        with monkeypatch.context() as patch:
+            patch.setattr("mavfi_cli.campaigns.ledger.os.access", lambda *_: False)
+            with pytest.raises(ConfigError, match="is read-only, and its run has not ended"):
+                Ledger(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.setattr("mavfi_cli.campaigns.ledger.os.access", lambda *_: False)
+    with Ledger(tmp_path) as ledger:
+        assert ledger.planned() == planned_missions > 0
+        assert sorted(tmp_path.iterdir()) == before  # no index of a log
+
+
 def test_a_full_disk_leaves_the_old_rows_and_half_of_none(tmp_path):
     with written(tmp_path) as ledger:
         ledger.add(0, **ROW)
