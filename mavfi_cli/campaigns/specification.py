@@ -8,6 +8,7 @@ import statistics
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from enum import Enum
+from pathlib import Path
 from typing import Any
 
 from mavfi_cli.campaigns.missions import Label, Labels, PlannedMission, Sampling, naming
@@ -274,6 +275,9 @@ class Spec:
     fixed_world: FixedWorld | None = None
 
     def __post_init__(self) -> None:
+        plain = Path(self.name).name == self.name and self.name.isprintable()
+        if not plain or self.name in ("", ".."):
+            raise ValueError(f"name: must be the name of a folder, without '/', got {self.name!r}")
         least_values = {"seed": 0, "first_seed": 0, "repetitions": 1, "faults_per_invocation": 1}
         for name, least in least_values.items():
             if (value := getattr(self, name)) < least:

@@ -106,6 +106,12 @@ def test_a_user_s_companion_has_no_strata():
         spec_of(text.format("uniform")).sampled(Sampling.STRATIFIED)
 
 
+@pytest.mark.parametrize("name", ["../mine", "/mine", "a/b", "..", ".", "", "a\\nb"])
+def test_a_name_that_leads_out_of_the_folder_of_campaigns_is_refused(name):
+    with pytest.raises(ConfigError, match="name: must be the name of a folder"):
+        spec_of(f'name = "{name}"\n{CROSSED}')
+
+
 def test_the_list_is_a_function_of_the_specification():
     assert spec_of(CROSSED).missions() == spec_of(CROSSED).missions()
     other = spec_of(CROSSED.replace("seed = 7", "seed = 8", 1)).missions()
