@@ -57,7 +57,7 @@ from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 _ALLOCATIONS = 100_000  # growth in live objects that starts the garbage collector
-COMPILING = "compiling the kernels, once on this machine: this takes a while"
+COMPILING = "compiling the {}, once on this machine: this takes a while"
 
 
 def fly_mission(
@@ -234,9 +234,10 @@ def _plan_injection(
 
 def _warm_up(config: MissionConfig, watcher: Watcher) -> None:
     detector = config.detector
-    known = detector is None or Protection.is_compiled(detector, config.stack)
-    if not (warm.is_compiled() and known):
-        watcher.on_note(COMPILING)
+    if not warm.is_compiled():
+        watcher.on_note(COMPILING.format("kernels"))
+    elif detector is not None and not Protection.is_compiled(detector, config.stack):
+        watcher.on_note(COMPILING.format("detector"))
     warm.warm_up()
     if detector is not None:
         Protection.warm_up(detector, config.stack)

@@ -22,7 +22,7 @@ def test_the_first_flight_on_a_machine_says_why_it_waits(command_line, monkeypat
     monkeypatch.setattr(warm, "is_compiled", lambda: False)
     short = (*SHORT_LINE, "--no-picture", "--time-limit=1")
     _, _, err = command_line(*short)
-    assert err.splitlines()[:2] == [run.COMPILING, "Flying solo in farm, seed 5"]
+    assert err.splitlines()[:2] == [run.COMPILING.format("kernels"), "Flying solo in farm, seed 5"]
     assert command_line(*short, "--quiet")[2] == ""
 
 
