@@ -48,7 +48,11 @@ def test_bad_input_is_one_line(command_line, tmp_path, monkeypatch, place, outpu
 
 @pytest.mark.parametrize(
     ("output", "told"),
-    [("no/where.html", "its folder does not exist"), ("/dev/null", "not a regular file")],
+    [
+        ("no/where.html", "its folder does not exist"),
+        ("/dev/null", "must end in .html or .htm"),
+        ("/", "is a directory"),
+    ],
 )
 def test_a_page_that_cannot_be_written_is_wrong_usage(command_line, output, told):
     left, out, err = command_line("report", ".", "-o", output)

@@ -193,7 +193,7 @@ def test_a_stack_in_both_kinds_of_worlds_is_judged_for_each_kind():
 
 @pytest.mark.parametrize(
     ("lost", "advice"),
-    [(8, "wrong value in a state.* helps: Gaussian detector"),
+    [(8, "wrong value in a state.*Gaussian detector helps"),
      (2, "wrong value in a state.* nothing "), (0, "^$")],
 )  # fmt: skip
 def test_the_advice_names_what_helps(lost, advice):
