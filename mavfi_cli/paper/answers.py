@@ -167,16 +167,17 @@ class Disagreement:
 
 
 def disagreements(claims: Sequence[JudgedClaim], place: str) -> list[Disagreement]:
-    """Group the claims that are contradicted at a place by reason, in the order of the claims."""
+    """Group the claims that are contradicted at a place by reason, in the order of the claims.
+
+    Those without a known reason are the last group.
+    """
     by_reason: dict[str, list[JudgedClaim]] = {}
     for judged in claims:
         judgement = judgement_of(judged, place)
         if judgement and judgement.verdict is Verdict.CONTRADICTED:
-            reason = reason_of(judged, place)
-            by_reason.setdefault(reason or judged.claim.name, []).append(judged)
-    return [
-        Disagreement(claims=mine, reason=reason_of(mine[0], place)) for mine in by_reason.values()
-    ]
+            by_reason.setdefault(reason_of(judged, place), []).append(judged)
+    known_first = sorted(by_reason.items(), key=lambda group: not group[0])
+    return [Disagreement(claims=mine, reason=reason) for reason, mine in known_first]
 
 
 def reason_of(judged: JudgedClaim, place: str) -> str:

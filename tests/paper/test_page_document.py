@@ -289,6 +289,9 @@ def test_reasons_are_of_claims_and_grouped(told):
     assert REASONS.keys() <= {claim.name for claim in CLAIMS}
     groups = disagreements(told.claims, "mavbench")
     assert all(each.claims for each in groups)
+    known = [bool(each.reason) for each in groups]
+    assert known == sorted(known, reverse=True)  # the others are one group, the last
+    assert known.count(False) <= 1
     names = [name for each in groups for name in each.names]
     assert names == [
         each.claim.name for each in told.claims
