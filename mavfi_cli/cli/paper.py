@@ -29,7 +29,7 @@ _output = section("Output")
 @_what("--worlds", type=click.Choice(["fixed", "many"]), default="fixed",
        help="Fly one fixed world of each environment, as the paper does, or another world for each "
             "seed.")  # fmt: skip
-@_what("--restart", "restart_s", type=Number(0.0, 3600.0), default=1.0,
+@_what("--restart", "node_restart_s", type=Number(0.0, 3600.0), default=1.0,
        help="Time until a node that died of a fault in an instruction works again, s; 3600 means "
             "never.")  # fmt: skip
 @_what("--compat", type=COMPAT, metavar="INJECTOR",

@@ -185,7 +185,7 @@ class FlightsPlan:
     Attributes:
         scale: fraction of the paper's number of missions.
         worlds: `fixed` for one world per environment, or `many` for one per seed.
-        restart_s: after a fault in an instruction, time until a dead node is restarted, s.
+        node_restart_s: after a fault in an instruction, time until a dead node is restarted, s.
         compat: injector whose operands and bits faults in instructions have; None for mavfi's.
         out: folder of all reproductions; each stack has its own folder in it.
     """
@@ -194,7 +194,7 @@ class FlightsPlan:
     stack: str
     scale: float = 1.0
     worlds: str = "fixed"
-    restart_s: float = MissionConfig().node_restart_s
+    node_restart_s: float = MissionConfig().node_restart_s
     compat: str | None = None
     out: Path = OUT
 
@@ -203,18 +203,25 @@ class FlightsPlan:
         """Return the plan of a reproduction, as stored in its ledger, for all items.
 
         Return None for any other campaign.
+
+        Raises:
+            ConfigError: another version of mavfi stored the plan, or it is damaged.
         """
         text = ledger.meta(_META)
         if text is None:
             return None
-        stored = {"worlds": "many", **json.loads(text)}  # older plans lack `worlds`
-        plan = cls(items=ITEMS, out=ledger.folder.parent, **stored)
+        try:
+            stored = {"worlds": "many", **json.loads(text)}  # older plans lack `worlds`
+            plan = cls(items=ITEMS, out=ledger.folder.parent, **stored)
+        except (TypeError, ValueError):
+            problem = "holds the plan of another version of mavfi, or a damaged one"
+            raise ConfigError(problem, path=ledger.folder) from None
         return replace(plan, items=plan.every)
 
     @property
     def rule(self) -> str:
         """Injector and restart rule, as a key of `Flights.by_rules`; empty for the usual ones."""
-        return Flights.rule(self.compat, self.restart_s)
+        return Flights.rule(self.compat, self.node_restart_s)
 
     @property
     def regime(self) -> Regime:
@@ -263,9 +270,9 @@ class FlightsPlan:
         """The command that flies all items on the plan's stack."""
         options = ("--stack", self.stack, "--scale", f"{self.scale:g}", "--worlds", self.worlds,
                    "--out", str(self.out))  # fmt: skip
-        restart = ("--restart", f"{self.restart_s:g}") if "restart_s" in self._rule else ()
-        compat = ("--compat", self.compat) if self.compat else ()
-        return shlex.join(["mavfi", "reproduce", *options, *restart, *compat])
+        names = {"node_restart_s": "--restart", "compat": "--compat"}
+        rule = [f"{names[name]}={value}" for name, value in self._rule.items()]
+        return shlex.join(["mavfi", "reproduce", *options, *rule])
 
     def missions(self, *items: Item) -> list[PlannedMission]:
         """List the missions without duplicates, by repetition, so that all items grow together.
@@ -326,16 +333,15 @@ class FlightsPlan:
 
     @property
     def _rule(self) -> dict[str, Any]:
-        """The values of `restart_s` and `compat` that are not the usual ones."""
-        own = {"restart_s": self.restart_s, "compat": self.compat}
+        """The factors of faults in instructions that are not the usual ones, with their values."""
+        own = {"node_restart_s": self.node_restart_s, "compat": self.compat}
         usual = FlightsPlan(items=(), stack=self.stack)
         return {name: value for name, value in own.items() if value != getattr(usual, name)}
 
     def _under_rule(self, setting: Setting) -> Setting:
         if not _of_instructions(setting):
             return setting
-        factors = {"restart_s": "node_restart_s", "compat": "compat"}
-        rule = {factors[name]: (value,) for name, value in self._rule.items()}
+        rule = {name: (value,) for name, value in self._rule.items()}
         return replace(setting, axes={**setting.axes, **rule})
 
     def _strikes_instructions(self, item: Item) -> bool:

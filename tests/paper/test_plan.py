@@ -56,7 +56,8 @@ def test_another_stack_flies_the_same_missions():
 
 
 def test_a_rule_changes_faults_in_instructions_only():
-    plan = FlightsPlan(items=(), stack="mavbench", scale=SCALE, restart_s=5.0, compat="rosfi-2021")
+    rule = {"node_restart_s": 5.0, "compat": "rosfi-2021"}
+    plan = FlightsPlan(items=(), stack="mavbench", scale=SCALE, **rule)
     assert plan.rule == "rosfi-2021, dead nodes back after 5 s"
     flown = plan.missions(*plan.every)
     usual = [own for own in missions(plan.every) if own.config.fault is None]
@@ -70,7 +71,7 @@ def test_a_rule_changes_faults_in_instructions_only():
             assert own.config == replace(other.config, instruction=fault, node_restart_s=5.0)
     with pytest.raises(ConfigError, match=r"fig8: has no faults in instructions.* table4, table5"):
         plan.named(["table4", "fig8"])
-    assert "--restart 5 --compat rosfi-2021" in plan.command
+    assert "--restart=5.0 --compat=rosfi-2021" in plan.command
 
 
 def test_an_item_has_a_preset_or_another_source():

@@ -193,7 +193,7 @@ def test_each_stack_has_its_own_folder(copied, tmp_path):
 
 @pytest.mark.slow
 def test_a_rule_is_kept_reported_and_settled(tmp_path):
-    never = replace(plan(tmp_path, "table4"), restart_s=3600.0)
+    never = replace(plan(tmp_path, "table4"), node_restart_s=3600.0)
     assert flown(never).missions == len(never.missions()) == 4 * 2 * (1 + 3 * 3)
     with Ledger(never.folder) as ledger:
         stored = FlightsPlan.stored(ledger)
@@ -220,6 +220,14 @@ def test_another_campaign_is_refused(tmp_path):
     book.ledger.close()
     with pytest.raises(ConfigError, match="not a reproduction"):
         flown(plan(tmp_path, "fig9"))
+
+
+@pytest.mark.parametrize("text", ["[]", "{", '{"stack": "mavbench", "of_tomorrow": 1}'])
+def test_a_plan_that_cannot_be_read_is_refused(copied, text):
+    with Ledger(copied.folder, writing=True) as ledger:
+        ledger.set_meta({"reproduction": text})
+    with pytest.raises(ConfigError, match="plan of another version of mavfi, or a damaged one"):
+        flown(copied)
 
 
 def test_other_versions_are_refused(copied, tmp_path):
