@@ -75,12 +75,15 @@ _output = section("Output")
 @_output("--out", type=types.OUT,
          help="Folder for vpm.json, vpm.csv and pictures; with --fly also for the flights, which "
               "are not flown again  [none; --fly: vpm].")  # fmt: skip
+@_output("--full", is_flag=True,
+         help="Print masses, sensitivities and the source of each number, too.")  # fmt: skip
 @_output("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 @_output("--csv", "as_csv", is_flag=True, help="Print the report as CSV, one scheme per row.")
 def vpm(
     vehicles: tuple[str, ...],
     out: Path | None,
     fly: bool,
+    full: bool,
     as_json: bool,
     as_csv: bool,
     **options: Any,
@@ -123,7 +126,7 @@ def vpm(
         model, flights = _flown(chosen, overheads, choices, out, quiet=options["quiet"])
     contents, table = views.model_json(model, flights), views.model_csv(model)
     flown = "" if flights is None else views.model_csv(flights)
-    lines = views.model_lines(model, flights)
+    lines = views.model_lines(model, flights, full=full)
     if out is not None:
         pictures = {name: draw(model) for name, draw in views.MODEL_PICTURES.items()}
         names = results.save(out, {"vpm.json": contents}, {"vpm.csv": table}, pictures)

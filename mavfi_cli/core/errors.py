@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Self, TypeVar
 
 E = TypeVar("E", bound=Enum)
+_LISTED = 40  # known names that an error lists: MAVLink has hundreds of messages and fields
 
 
 class MavfiError(Exception):
@@ -77,7 +78,8 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
 def _suggestion(name: str, known: Iterable[str]) -> str:
     names = sorted(known)
     match = nearest(name, names)
-    listed = ", ".join(names)
+    more = len(names) - _LISTED
+    listed = ", ".join(names) if more <= 0 else f"{', '.join(names[:_LISTED])} and {more} more"
     return f"did you mean {match!r}? Known: {listed}" if match else f"known: {listed}"
 
 

@@ -144,17 +144,24 @@ def _number_with_ends(name: str, number: ModelAndFlights) -> dict[str, float]:
 # Text: the model ----------------------------------------------------------------------------------
 
 
-def model_lines(model: ModelReport, flights: FlightsReport | None = None) -> list[str]:
-    """Return the report of the model as lines of text, followed by that of its flights if given."""
+def model_lines(
+    model: ModelReport, flights: FlightsReport | None = None, *, full: bool = False
+) -> list[str]:
+    """Return the report of the model as lines of text, followed by that of its flights if given.
+
+    The full report adds masses, roofs, sensitivities and the source of each number.
+    """
+    knee = f"; knee: where velocity is {100 * model.knee_velocity_over_roof_ratio:g} % of the roof"
     lines = [
-        f"Model {model.model}; knee: where velocity is "
-        f"{100 * model.knee_velocity_over_roof_ratio:g} % of the roof",
+        f"Model {model.model}{knee if full else ''}",
         f"Flights of {model.distance_m:g} m at the safe velocity and hovering power; ratios "
         f"are over {model.ratios_over}",
     ]
     lines += [f"Note: {note}" for note in model.notes]
     for vehicle in model.vehicles:
-        lines += ["", *_vehicle_lines(vehicle, model.ratios_over)]
+        lines += ["", *_vehicle_lines(vehicle, model.ratios_over, full=full)]
+    if not full:
+        lines += ["", "--full prints masses, sensitivities and the source of each number, too"]
     return [*lines, *(() if flights is None else _flight_lines(flights))]
 
 
@@ -166,18 +173,20 @@ def _flying(vehicle: VehicleReport) -> list[tuple[SchemeResult, Performance, Rat
     ]
 
 
-def _vehicle_lines(vehicle: VehicleReport, over: str) -> Iterator[str]:
+def _vehicle_lines(vehicle: VehicleReport, over: str, *, full: bool) -> Iterator[str]:
     title = f": {vehicle.description}" if vehicle.description else ""
     yield f"== {vehicle.vehicle}{title}; board {vehicle.board} =="
     yield from (f"Note: {note}" for note in vehicle.notes)
     flying = _flying(vehicle)
-    yield from Table([
-        ["scheme", "boards", "compute", "mass", "thrust/weight", "acceleration", "roof", "knee"],
-        *([row.scheme, f"{row.boards}", f"{row.compute_kg:.3f} kg", f"{row.mass_kg:.3f} kg",
-           f"{own.thrust_to_weight:.2f} N/N", f"{own.acceleration_mps2:.2f} m/s²",
-           f"{own.roof_mps:.2f} m/s", f"{own.knee_hz:.1f} Hz"] for row, own, _ in flying),
-    ]).lines()  # fmt: skip
-    yield ""
+    if full:
+        yield from Table([
+            ["scheme", "boards", "compute", "mass", "thrust/weight", "acceleration", "roof",
+             "knee"],
+            *([row.scheme, f"{row.boards}", f"{row.compute_kg:.3f} kg", f"{row.mass_kg:.3f} kg",
+               f"{own.thrust_to_weight:.2f} N/N", f"{own.acceleration_mps2:.2f} m/s²",
+               f"{own.roof_mps:.2f} m/s", f"{own.knee_hz:.1f} Hz"] for row, own, _ in flying),
+        ]).lines()  # fmt: skip
+        yield ""
     yield from Table([
         ["scheme", "overhead", "throughput", "velocity", "bound by", "sensor ceiling",
          "compute ceiling"],
@@ -195,8 +204,11 @@ def _vehicle_lines(vehicle: VehicleReport, over: str) -> Iterator[str]:
            f"{own.missions:.1f} missions"] for row, own, ratios in flying),
     ]).lines()  # fmt: skip
     yield from (f"{row.scheme}: {row.problem}" for row in vehicle.schemes if row.problem)
-    yield from _sensitivity_lines(vehicle.sensitivity)
+    if full:
+        yield from _sensitivity_lines(vehicle.sensitivity)
     yield from _calibration_lines(vehicle.calibrations)
+    if not full:
+        return
     yield ""
     yield from Table([
         ["number", "value", "source"],

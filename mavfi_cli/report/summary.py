@@ -107,7 +107,7 @@ def _flight_lines(flight: FlightRecord) -> list[str]:
     if qof.flight_time_s is None:
         return ["Flight      none: the mission ended before the companion took over"]
     lines = [
-        f"Flight      {_number(qof.flight_time_s, 's')}, "
+        f"Flight      {_number(qof.flight_time_s, 's')} from take-over, "
         f"{_number(qof.distance_m, 'm')} flown, "
         f"{_number(qof.goal_distance_m, 'm', 2)} from the goal",
         *_clearance_and_energy(qof),
@@ -254,8 +254,8 @@ def _fault_lines(flight: FlightRecord) -> list[str]:
         return []
     trigger = fault.trigger
     when = {
-        "random": f"at a random moment ({_number(trigger.drawn_time_s, 's', 2)} into the flight)",
-        "time": f"{trigger.number:g} s into the flight",
+        "random": f"at a random moment ({_number(trigger.drawn_time_s, 's', 2)} after take-over)",
+        "time": f"{trigger.number:g} s after take-over",
         "tick": f"at control tick {trigger.number:g}",
         "phase": f"once the pilot is in the phase {trigger.phase}",
         "foreseen": "once a collision is foreseen",
@@ -266,8 +266,12 @@ def _fault_lines(flight: FlightRecord) -> list[str]:
     what = f"{place} {states}: {request['persistence']} {request['effect']}"
     if fault.stage == "process":
         effect, _, share = request["effect"].partition("=")
-        struck = {"flip": "is killed", "stop": "is stopped", "slow": f"is slowed to {share}"}
-        what = f"{states} {struck[effect]}"
+        struck = {
+            "flip": "is killed", "stop": "is stopped", "slow": f"is slowed to {share} of a processor",
+        }  # fmt: skip
+        lasts_s = request.get("duration_s")
+        lasting = "" if lasts_s is None else f" for {lasts_s:g} s"
+        what = f"{states} {struck[effect]}{lasting}"
     lines = [f"Fault       {what}, {when}"]
     if fault.state == "not_injected":
         lines.append(f"            not injected: {fault.reason}")
@@ -364,7 +368,7 @@ def difference_lines(run: Run, golden: Run) -> list[str]:
     if parting is None or run.first_difference(golden, leave_out=struck) is None:
         why = "none" if fault is None else _no_effect(fault)
         return [f"Effect      {why}: nothing else ever differs from the golden flight"]
-    sides = ["inf or nan" if v is None else v for v in (parting.this, parting.other)]
+    sides = ["not finite" if v is None else v for v in (parting.this, parting.other)]
     lines = [
         f"Effect      first at {parting.stamp_s:.2f} s in {parting.column}: "
         f"{' instead of '.join(format_distinct(*sides))}",

@@ -29,7 +29,9 @@ def test_notes_stand_above_the_tables(command_line):
     assert len(notes) == 3
     assert "overhead of gad" in notes[0]
     assert "board is raspi3b" in notes[1]
-    assert out.index(notes[2]) < out.index("scheme  boards")
+    assert out.index(notes[2]) < out.index("scheme  overhead")
+    assert "number  " not in out
+    assert out.rstrip().split("\n")[-1].startswith("--full prints ")
 
 
 def test_csv_and_json_say_the_same(command_line, tmp_path):
@@ -75,7 +77,7 @@ def test_every_number_of_the_json_has_its_unit(command_line):
 
 def test_every_number_of_the_table_has_its_unit(command_line):
     """In each row of a scheme, only its boards are a count without a word; rows fit a terminal."""
-    _, out, _ = command_line("vpm", "--vehicle", "spark")
+    _, out, _ = command_line("vpm", "--vehicle", "spark", "--full")
     unit = r"(?:%|kg|N/N|m/s²|m/s|Hz|s|W|kJ|missions)(?= |$)"
     found = [line for line in out.splitlines() if re.match(r"(none|dmr|tmr|gad|aad) ", line)]
     assert len(found) == 15
@@ -181,7 +183,7 @@ def test_a_chain_of_no_latencies_is_refused(command_line, arguments, said):
 
 
 def test_a_chain_says_how_a_platform_s_latencies_add_up(command_line):
-    line = ("vpm", "--vehicle", "airsim", "--platform", "tx2", "--chain", "pipelined")
+    line = ("vpm", "--vehicle", "airsim", "--platform", "tx2", "--chain", "pipelined", "--full")
     code, out, _ = command_line(*line)
     assert code == 0
     assert "platform tx2: slowest of point_cloud, octomap" in out

@@ -29,7 +29,7 @@ def test_the_figures_are_those_of_the_record(result):
     text = "\n".join(summary_lines(FlightRecord.of(result)))
     quality = result["quality_of_flight"]
     for figure in (
-        f"{quality['flight_time_s']:.1f} s, ",
+        f"{quality['flight_time_s']:.1f} s from take-over, ",
         f"{quality['distance_m']:.1f} m flown",
         f"{quality['goal_distance_m']:.2f} m from the goal",
         f"{quality['min_clearance_m']:.2f} m minimum",
@@ -70,7 +70,7 @@ def test_what_is_not_known_is_said_so(result):
     result["response_time_s"] = {"median": None, "p95": None, "count": 0}
     result["host"]["flight_wall_s"] = 0.0
     text = "\n".join(summary_lines(FlightRecord.of(result)))
-    assert "Flight      12.0 s, 30.0 m flown, not known" in text
+    assert "Flight      12.0 s from take-over, 30.0 m flown, not known" in text
     assert "Clearance   not known\n" in text
     assert "Energy      not known\n" in text
     assert "None" not in text
