@@ -360,7 +360,10 @@ def _forest(claims: Sequence[JudgedClaim], stacks: Sequence[str]) -> Picture | N
         for stack, effect in zip(stacks, row.effects, strict=False)
         if effect
     ).csv()  # fmt: skip
-    title = "Effects with their 95 % intervals beside the ranges that the paper's claims give"
+    title = (
+        "Effects with their 95 % intervals beside the ranges that the paper's claims give. "
+        "The colour of a full mark is that of its verdict"
+    )
     broad, narrow = (draw_forest(rows, stacks, columns) for columns in ("two", "one"))
     return Picture.of("forest", title, broad, csv, narrow)
 

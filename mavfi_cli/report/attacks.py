@@ -20,7 +20,7 @@ from mavfi_cli.attack.target import RunOutcome, signal_name
 from mavfi_cli.core.files import Json, write_json, write_text
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.report.drawing import INK, NOTE, new_figure, open_frame, write_figure
-from mavfi_cli.report.table import WIDTH, Table, percent, rate
+from mavfi_cli.report.table import WIDTH, Table, folded, percent, rate
 from mavfi_cli.stats.shares import Cluster, Share, clustered_share, unseen_share
 
 if TYPE_CHECKING:
@@ -268,7 +268,8 @@ class _KernelsSummary:
             "widened by the spread between windows where windows are sampled",
             f"inputs: {self.plan['flight']}; tolerance {self.plan['tolerance']:g}",
         ]
-        return "\n".join([*lines, *(line for kernel in self.kernels for line in kernel.lines())])
+        notes = (line for kernel in self.kernels for line in kernel.lines())
+        return "\n".join([*lines, *(part for note in notes for part in folded(note, "    "))])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -317,7 +318,8 @@ class _ProgramSummary:
                 missed = 100 * profile.not_reached
                 how = f"counted by callgrind; {missed:.2g} % of the executions are not reached"
             lines.append(f"{profile.executed} executed instructions in scope, {how}")
-        return "\n".join([*lines, *self.counts.lines("")])
+        notes = self.counts.lines("")
+        return "\n".join([*lines, *(part for note in notes for part in folded(note, "  "))])
 
 
 def summarise(plan: Plan, campaign: Sequence[TargetRuns]) -> _KernelsSummary | _ProgramSummary:

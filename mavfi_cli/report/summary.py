@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from mavfi_cli.fi.bits import format_distinct
 from mavfi_cli.fi.tracer.image import short_name
 from mavfi_cli.mission.measures import DetectionCost, FlightRecord
 from mavfi_cli.mission.run_folder import Run
-from mavfi_cli.report.table import WIDTH
+from mavfi_cli.report.table import folded
 
 _INDENT = 12 * " "
 _OUTCOMES = {
@@ -53,7 +52,7 @@ def outcome_line(flight: FlightRecord) -> str:
 
 
 def summary_lines(flight: FlightRecord) -> list[str]:
-    """Return the lines of text that summarise a flight, folded at WIDTH characters.
+    """Return the lines of text that summarise a flight, folded at 100 characters.
 
     They cover outcome, mission, flight, faults, nodes, detection, response time and host time.
     """
@@ -82,13 +81,7 @@ def summary_lines(flight: FlightRecord) -> list[str]:
         )
     lines += _measured_lines(flight.measured_platform)
     lines += _host_lines(flight)
-    return [part for line in lines for part in _folded(line)]
-
-
-def _folded(line: str) -> list[str]:
-    return textwrap.wrap(
-        line, WIDTH, subsequent_indent=_INDENT, break_long_words=False, break_on_hyphens=False
-    ) or [""]
+    return [part for line in lines for part in folded(line, _INDENT)]
 
 
 def _host_lines(flight: FlightRecord) -> list[str]:

@@ -197,6 +197,13 @@ FORMATS: Mapping[str, Callable[[Table], str]] = {
 }
 
 
+def folded(line: str, indent: str) -> list[str]:
+    """Fold a line at WIDTH characters. Further lines start with `indent`; no word is broken."""
+    return textwrap.wrap(
+        line, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    ) or [""]
+
+
 def _text(value: object) -> str:
     return "" if value is None else str(value)
 

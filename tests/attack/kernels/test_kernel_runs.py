@@ -17,6 +17,7 @@ from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import write_json
 from mavfi_cli.report.attacks import KERNEL_COLUMNS, save_runs, summarise
+from mavfi_cli.report.table import WIDTH
 
 OUTCOMES = {"benign", "crash", "hang", "sdc", "not_injected"}
 
@@ -255,6 +256,7 @@ def test_the_summary_has_what_numbers_depend_on(control_campaign, tmp_path):
     text = summary.text()
     assert "sampling: instruction-uniform" in text
     assert "input 4: all" in text
+    assert max(map(len, text.split("\n"))) <= WIDTH
     files = save_runs(tmp_path, summary, campaign)
     first = {name: (tmp_path / name).read_bytes() for name in files}
     save_runs(tmp_path, summary, campaign)
