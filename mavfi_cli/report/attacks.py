@@ -8,9 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from mavfi_cli.analysis.kernels import KERNELS
+from mavfi_cli.analysis.kernels import KERNELS, OUTCOMES
 from mavfi_cli.attack.campaign import Plan, TargetRuns
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.catalogue import Kernel
@@ -19,13 +18,10 @@ from mavfi_cli.attack.null_runs import NullRuns
 from mavfi_cli.attack.target import RunOutcome, signal_name
 from mavfi_cli.core.files import Json, write_json, write_text
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
-from mavfi_cli.report.drawing import INK, NOTE, new_figure, open_frame, write_figure
+from mavfi_cli.report.drawing import write_figure
+from mavfi_cli.report.paper import PaperCell, PaperColumn, PaperRow, PaperTable, draw_stack
 from mavfi_cli.report.table import WIDTH, Table, folded, percent, rate
 from mavfi_cli.stats.shares import Cluster, Share, clustered_share, unseen_share
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 SCHEMA = 2
 _OF_EVERY_RUN = (
@@ -417,7 +413,7 @@ def save_runs(
     write_json(folder / KERNELS, contents)
     if isinstance(summary, _ProgramSummary):
         return KERNELS, "kernels.csv"
-    write_figure(_kernel_figure(summary), folder / "kernels.svg")
+    write_figure(draw_stack(_as_table(summary), "two"), folder / "kernels.svg")
     return KERNELS, "kernels.csv", "kernels.svg"
 
 
@@ -430,68 +426,15 @@ def _cells(entry: FaultRecord, columns: Sequence[str]) -> dict[str, str]:
     return {name: "" if flat.get(name) is None else str(flat[name]) for name in columns}
 
 
-# -- the picture of a campaign on kernels: stacked bars with confidence intervals
-
-_COLOURS = {"sdc": "#8e5aa3", "crash": "#e4572e", "hang": "#f2b134", "benign": "#c3d4e6"}
-_DARKER = {"sdc": "#6d3f84", "crash": "#b23a17", "hang": "#a06c00", "benign": "#4f6a88"}
-_WIDTH = 0.6
-_ROOM = 5.0  # per cent; minimum share for a number inside its bar segment
-_LINE = 3.2  # per cent; height of a line of numbers
-_VISIBLE = 0.5  # per cent; minimum width of a drawn interval
-_LABELS = {"benign": "benign", "crash": "crash", "hang": "hang", "sdc": "SDC"}
-
-
-def _kernel_figure(summary: _KernelsSummary) -> Figure:
-    """Draw one bar per kernel, divided into the outcomes of its injected runs in per cent."""
-    kernels = summary.kernels
-    figure = new_figure(max(5.2, 1.8 + 1.05 * len(kernels)), 4.4)
-    axes = figure.add_subplot()
-    for place, kernel in enumerate(kernels):
-        _bar(axes, place, kernel.counts.outcomes)
-    ticks = [f"{k.kernel.title}\nn = {k.counts.outcomes['benign'].total}" for k in kernels]
-    axes.set_xticks(range(len(kernels)), ticks, fontsize=8)
-    axes.set_ylim(0.0, 100.0)
-    axes.set_xlim(-0.6, len(kernels) - 0.4)
-    axes.set_ylabel("share of injected runs, %")
-    open_frame(axes)
-    handles = [axes.bar(0, 0, color=colour, label=_LABELS[n]) for n, colour in _COLOURS.items()]
-    figure.legend(handles=handles, loc="outside upper center", ncols=4, frameon=False)
-    bits = summary.plan["model"]["bits"]
-    figure.supxlabel(
-        f"{'one bit' if bits == 1 else f'{bits} bits'} flipped a run; sampling: "
-        f"{summary.sampling}\nwhiskers: 95 % Wilson interval of a segment's share, at its upper "
-        "edge; benign is the rest",
-        fontsize=7, color=NOTE,
+def _as_table(summary: _KernelsSummary) -> PaperTable:
+    """Return the shares of the outcomes of each kernel's injected runs, as in Fig. 6."""
+    rows = []
+    for kernel in summary.kernels:
+        shares = [kernel.counts.outcomes[name] for name in OUTCOMES]
+        label = f"{kernel.kernel.title}, n = {shares[0].total}"
+        rows.append(PaperRow(labels=(label,), cells=tuple(map(PaperCell.of_share, shares))))
+    titles = (RunOutcome(name).title for name in OUTCOMES)
+    return PaperTable(
+        name="kernels", title="Outcomes of isolated kernels", labels=("kernel",),
+        columns=tuple(PaperColumn(title=title) for title in titles), rows=tuple(rows),
     )  # fmt: skip
-    return figure
-
-
-def _bar(axes: Axes, place: int, outcomes: Mapping[str, Share]) -> None:
-    """Draw a kernel's outcomes as stacked segments of a bar.
-
-    Each segment except the last one has the interval of its share at its upper edge.
-    """
-    base, below = 0.0, -_LINE / 2  # keeps numbers off the axis
-    for number, (name, colour) in enumerate(_COLOURS.items()):
-        row = outcomes[name]
-        share = 100.0 * row.share if row.total else 0.0
-        axes.bar(place, share, bottom=base, width=_WIDTH, color=colour)
-        if share >= _ROOM:
-            axes.text(
-                place - 0.16, base + share / 2, f"{share:.0f}", color=INK, fontsize=8.5,
-                ha="center", va="center",
-            )  # fmt: skip
-        elif row.count:
-            below = max(base + share / 2, below + _LINE)
-            text = f"{share:.1f}" if share >= 0.05 else "< 0.1"
-            axes.text(
-                place + _WIDTH / 2 + 0.03, below, text, color=_DARKER[name], fontsize=7.5,
-                ha="left", va="center",
-            )  # fmt: skip
-        low, high = 100.0 * row.low, 100.0 * row.high
-        if row.count and name != "benign" and high - low >= _VISIBLE:
-            axes.errorbar(
-                place + 0.03 + 0.1 * number, base + share, [[share - low], [high - share]],
-                color=INK, elinewidth=0.9, capsize=2.0,
-            )  # fmt: skip
-        base += share

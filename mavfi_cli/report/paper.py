@@ -388,19 +388,33 @@ _HATCHES = ("", "////", "....", "")
 
 
 def draw_stack(table: PaperTable, columns: str = "one") -> Figure:
-    """Draw each row of a table as a bar of 100 per cent, divided into the shares in its columns."""
+    """Draw each row of a table as a bar of 100 per cent, divided into the shares in its columns.
+
+    The line across the end of a part is the interval of its share. The last part, which is the
+    rest, has none.
+    """
+    from matplotlib.patheffects import withStroke
+
     rows = len(table.rows)
     figure = new_figure(WIDTHS_IN[columns], 0.85 + 1.25 * _LINE_IN * rows)
     axes = figure.subplots()
     print_axes(axes)
     left = np.zeros(rows)
     for style, column in enumerate(table.columns):
-        shares = np.array([row.cells[style].value for row in table.rows])
+        cells = [row.cells[style] for row in table.rows]
+        shares = np.array([cell.value for cell in cells])
         axes.barh(
             range(rows), shares, left=left, height=0.7, color=PALETTE[style], edgecolor="white",
             linewidth=0.4, hatch=_HATCHES[style], label=column.title.removesuffix(", %"),
         )  # fmt: skip
         left += shares
+        for y, cell in enumerate(cells):
+            if cell.value > 0.0 and style + 1 < len(table.columns):
+                start = left[y] - cell.value
+                axes.hlines(
+                    y - 0.2 + 0.2 * style, start + cell.low, start + cell.high, color=INK,
+                    linewidth=0.9, path_effects=[withStroke(linewidth=2.2, foreground="white")],
+                )  # fmt: skip
     axes.set_yticks(range(rows), [row.labels[0] for row in table.rows], fontsize=SMALLEST)
     axes.set_ylim(rows - 0.4, -0.6)
     axes.set_xlim(0.0, 100.0)

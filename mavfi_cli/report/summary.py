@@ -260,8 +260,10 @@ def _fault_lines(flight: FlightRecord) -> list[str]:
     if fault.stage == "process":
         effect, _, share = request["effect"].partition("=")
         struck = {
-            "flip": "is killed", "stop": "is stopped", "slow": f"is slowed to {share} of a processor",
-        }  # fmt: skip
+            "flip": "is killed",
+            "stop": "is stopped",
+            "slow": f"is slowed to {share} of a processor",
+        }
         lasts_s = request.get("duration_s")
         lasting = "" if lasts_s is None else f" for {lasts_s:g} s"
         what = f"{states} {struck[effect]}{lasting}"

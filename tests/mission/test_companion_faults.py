@@ -373,7 +373,11 @@ def test_a_stopped_program_does_not_run_and_goes_on(tmp_path, share):
     [
         ({"target": f"{SETPOINT}.vx", "exact_bits": (30,)}, "success", "2 -> 0"),
         ({"target": "process.hop"}, "crash", "process.hop is killed"),
-        ({"target": "process.hop", "effect": "stop", "duration_s": 2.0}, "success", "is stopped for 2 s"),
+        (
+            {"target": "process.hop", "effect": "stop", "duration_s": 2.0},
+            "success",
+            "is stopped for 2 s",
+        ),
         (
             {"target": "process.hop", "effect": "slow=0.5", "duration_s": 2.0},
             "success",
