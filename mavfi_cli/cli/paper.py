@@ -108,7 +108,7 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
         help="Bit flips per hour that reach the injection sites, for the table of failures per "
              "flight hour.")  # fmt: skip
 @option("--json", "as_json", is_flag=True,
-        help="Print the file, its number of missions and the count of each verdict as "
+        help="Print the file, its number of missions, and the verdicts with their numbers as "
              "JSON.")  # fmt: skip
 def report(places: tuple[Path, ...], output: Path, upsets: float, as_json: bool) -> None:
     """Write one HTML file: the paper's claims, tables and figures beside flown missions.
@@ -121,7 +121,7 @@ def report(places: tuple[Path, ...], output: Path, upsets: float, as_json: bool)
 
     require_page(output)  # fail before the slow part
     from mavfi_cli.cli.progress import steps_view
-    from mavfi_cli.core.files import write_text
+    from mavfi_cli.core.files import plain, write_text
     from mavfi_cli.paper.document import document
     from mavfi_cli.paper.sources import Evidence
 
@@ -138,6 +138,7 @@ def report(places: tuple[Path, ...], output: Path, upsets: float, as_json: bool)
     if as_json:
         summary = {"file": str(output), "bytes": size, "missions": missions,
                    "answer": content.answer, "verdicts": content.verdicts(),
+                   "claims": plain([claim.as_dict() for claim in content.claims]),
                    "problems": [*evidence.problems]}  # fmt: skip
         echo(json.dumps(summary, indent=2))
     else:

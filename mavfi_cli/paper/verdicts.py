@@ -19,6 +19,7 @@ from mavfi_cli.analysis.pairs import Fate, Flights
 from mavfi_cli.campaigns.progress import duration
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, lack_of
+from mavfi_cli.core.files import Json
 from mavfi_cli.stats.paired import holm
 from mavfi_cli.stats.sequences import anytime_count, anytime_interval, anytime_p
 from mavfi_cli.stats.shares import Interval, wilson, z_of
@@ -140,6 +141,18 @@ class JudgedClaim:
         """
         judgement = self.judgements.get(place, {}).get(fate)
         return None if judgement is None else judgement.verdict
+
+    def as_dict(self) -> Json:
+        """Return the claim in words, and its judgements by place and by fate of the faults."""
+        judged = {
+            place: {
+                fate.value: asdict(judgement) | {"verdict": judgement.verdict.value}
+                for fate, judgement in fates.items()
+            }
+            for place, fates in self.judgements.items()
+        }
+        told = {name: getattr(self.claim, name) for name in ("name", "item", "words", "unit")}
+        return {**told, "judgements": judged}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -23,6 +23,12 @@ def test_a_script_gets_the_verdicts_and_what_is_missing_is_on_stderr(command_lin
     known = {verdict.value for verdict in Verdict}
     assert all(set(counts) == known for counts in told["verdicts"].values())
     assert sum(told["verdicts"]["mavbench"].values()) > 0
+    verdicts = [
+        claim["judgements"]["mavbench"]["all faults"]["verdict"]
+        for claim in told["claims"]
+        if "mavbench" in claim["judgements"]
+    ]
+    assert {name: verdicts.count(name) for name in known} == told["verdicts"]["mavbench"]
     assert err.startswith("note: ")
     assert "holds no campaign" in err
     assert "holds no campaign" in page.read_text(encoding="utf-8")
