@@ -183,29 +183,31 @@ def disagreements(claims: Sequence[JudgedClaim], place: str) -> list[Disagreemen
 def reason_of(judged: JudgedClaim, place: str) -> str:
     """Return the known reason why a claim is contradicted at a place, or an empty string.
 
-    A reason explains one effect, on the paper's stack or in isolated kernels. It is returned only
-    if the claim is contradicted and its effect lies in the interval that the reason explains.
+    A reason explains one effect, on one stack under one rule or in isolated kernels. It is returned
+    only if the claim is contradicted and its effect lies in the interval that the reason explains.
     """
-    words, low, high = REASONS.get(judged.claim.name, ("", 0.0, 0.0))
+    where = Regime(STACKS[0]) if judged.claim.isolated else Regime.of(place)
+    words, low, high = REASONS.get((where.stack, where.rule, judged.claim.name), ("", 0.0, 0.0))
     judgement = judgement_of(judged, place)
     if not judgement or judgement.verdict is not Verdict.CONTRADICTED or judgement.effect is None:
         return ""
-    where = Regime.of(place)
-    explained = judged.claim.isolated or (where.stack == STACKS[0] and not where.rule)
-    return words if explained and low <= judgement.effect.value <= high else ""
+    return words if low <= judgement.effect.value <= high else ""
 
 
-def _read_reasons() -> Mapping[str, tuple[str, float, float]]:
+def _read_reasons() -> Mapping[tuple[str, str, str], tuple[str, float, float]]:
     data, _ = read_toml(Path(__file__).parent / "reasons.toml")
     return {
-        name: (reason["words"], *ends)
+        (reason.get("stack", STACKS[0]), reason.get("rule", ""), name): (reason["words"], *ends)
         for reason in data["reason"]
         for name, ends in reason["intervals"].items()
     }
 
 
 REASONS = _read_reasons()
-"""Reasons for contradicted claims, by claim name, with the interval of effects they explain."""
+"""Reasons for contradicted claims, and the interval of effects that each explains.
+
+The keys are the stack, the injector and restart rule as in `Regime`, and the claim's name.
+"""
 
 
 # What a designer should do ------------------------------------------------------------------------

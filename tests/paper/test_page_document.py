@@ -286,7 +286,7 @@ def test_a_kept_flight_has_its_picture_and_a_link_to_a_file_is_none(tmp_path):
 
 
 def test_reasons_are_of_claims_and_grouped(told):
-    assert REASONS.keys() <= {claim.name for claim in CLAIMS}
+    assert {name for _, _, name in REASONS} <= {claim.name for claim in CLAIMS}
     groups = disagreements(told.claims, "mavbench")
     assert all(each.claims for each in groups)
     known = [bool(each.reason) for each in groups]
@@ -299,6 +299,9 @@ def test_reasons_are_of_claims_and_grouped(told):
     ]  # fmt: skip
 
 
+NEVER = "mavbench-replica, dead nodes never back"
+
+
 @pytest.mark.parametrize(
     ("name", "stack", "verdict", "effect", "explained"),
     [
@@ -306,6 +309,9 @@ def test_reasons_are_of_claims_and_grouped(told):
         ("table4-gad", "mavbench", Verdict.CONTRADICTED, -0.5, False),
         ("table4-gad", "mavbench", Verdict.UNDECIDED, -0.1, False),
         ("table4-gad", "hardened", Verdict.CONTRADICTED, -0.1, False),
+        ("table4-gad", "mavbench-replica", Verdict.CONTRADICTED, 0.0, True),
+        ("table4-dense", "mavbench-replica", Verdict.CONTRADICTED, 0.39, False),
+        ("table4-dense", NEVER, Verdict.CONTRADICTED, 0.39, True),
         ("fig6-octomap", "hardened", Verdict.CONTRADICTED, -0.147, True),
         ("fig6-octomap", "hardened", Verdict.CONTRADICTED, -0.4, False),
     ],
