@@ -260,7 +260,17 @@ class Flights:
     @property
     def population(self) -> str:
         """A sentence that says for which worlds the intervals of these flights hold."""
-        places = [*zip(self["world"], self["world_seed"], strict=True)]
+        return self.population_of(zip(self["world"], self["world_seed"], strict=True))
+
+    @staticmethod
+    def population_of(worlds: Iterable[tuple[str, int | None]]) -> str:
+        """Return a sentence that says for which worlds intervals hold.
+
+        Args:
+            worlds: the world of each flight and its seed, which is None if every seed has another
+                world.
+        """
+        places = [*worlds]
         named = sorted({place for place in places if place[1] is not None})
         each = ", ".join(f"{world} {seed}" for world, seed in named)
         fixed = each if len(named) <= _MOST_NAMED else f"{len(named)} of them"
@@ -270,7 +280,7 @@ class Flights:
         if not many:
             return f"worlds: fixed ({fixed}); intervals hold for these worlds only"
         return (
-            f"worlds: fixed ({fixed}) in {len(self) - many:,} flights, another one for each seed "
+            f"worlds: fixed ({fixed}) in {len(places) - many:,} flights, another one for each seed "
             f"in {many:,}; intervals hold for neither kind alone"
         )
 

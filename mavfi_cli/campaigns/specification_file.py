@@ -41,14 +41,17 @@ def load_spec(name: str) -> Spec:
 
     Raises:
         UnknownName: the name is neither a preset nor a file, or `[fixed_world]` names a world
-            without missions.
+            without missions. A shipped table of fixed worlds may name more than the missions fly.
         ConfigError: the file is invalid.
     """
     path = PRESETS.path(name)
     spec = parse_spec(read_text(path), path if path == Path(name) else Path(path.name))
     if spec.fixed_world is not None:
         flown = {mission.config.world for mission in spec.kinds()}
-        for world in spec.fixed_world.worlds:
+        shipped = (read_toml(_FIXED_WORLDS.path(name))[0] for name in _FIXED_WORLDS.names)
+        known = {seed for table in shipped for seed in table["world_seed"].items()}
+        own = dict(spec.fixed_world.world_seed.items() - known)
+        for world in (*spec.fixed_world.worlds, *sorted(own)):
             if world not in flown:
                 raise UnknownName("world of [fixed_world]", world, flown)
     return spec

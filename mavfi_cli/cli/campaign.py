@@ -378,5 +378,6 @@ def _show(
         lines += CampaignReport.of(ledger, by, confidence, **parts).lines()
     else:
         table, _ = shown(ledger)
+        lines = [line for line in lines if line not in table.notes]
         lines += ["", *short(table).formatted("text").rstrip().split("\n")]
     echo_lines(lines)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,7 +14,9 @@ from typing import Self
 import pyarrow as pa
 
 from mavfi_cli.analysis.failures import SettingFailures, setting_failures
+from mavfi_cli.analysis.flights import flights, flown
 from mavfi_cli.analysis.overhead import FlightOverhead, flight_overheads
+from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.analysis.summary import (
     INACTIVE,
     METRICS,
@@ -28,11 +31,11 @@ from mavfi_cli.analysis.summary import (
 )
 from mavfi_cli.campaigns.begin import stopped, stored_spec
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.campaigns.missions import Sampling, label_text
+from mavfi_cli.campaigns.missions import Injected, Sampling, label_text
 from mavfi_cli.campaigns.specification import FixedWorld
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import Json
-from mavfi_cli.core.types import Stage
+from mavfi_cli.core.types import Outcome, Stage
 from mavfi_cli.mission.measures import HOST_CHECKS
 from mavfi_cli.report.setting_table import BY_WEIGHT, UNPAIRED, SettingColumns, SettingRow
 from mavfi_cli.report.table import number, percent, rate, spread, with_ends
@@ -56,12 +59,15 @@ class CampaignReport:
     Attributes:
         stopped: settings that the stopping rule has ended early.
         fixed_world: the fixed world of all missions; None if there is none.
+        lost_worlds: a line for each fixed world in which no golden flight succeeds; None if there
+            is none.
         quality, overhead, failures: the optional parts of the report; None unless requested.
     """
 
     summary: CampaignSummary
     stopped: Sequence[str] = ()
     fixed_world: FixedWorld | None = None
+    lost_worlds: Sequence[str] | None = None
     quality: Sequence[Quality] | None = None
     overhead: Sequence[FlightOverhead] | None = None
     failures: Sequence[SettingFailures] | None = None
@@ -96,6 +102,7 @@ class CampaignReport:
             summary=summarise(ledger, settings, confidence),
             stopped=stopped(ledger),
             fixed_world=None if spec is None else spec.fixed_world,
+            lost_worlds=_lost_worlds(ledger) or None,
             quality=qualities(settings, confidence) if quality else None,
             overhead=flight_overheads(ledger, settings, confidence) if overhead else None,
             failures=setting_failures(ledger, settings, kernels, upsets, confidence)
@@ -121,11 +128,40 @@ class CampaignReport:
 
 
 def state_lines(ledger: Ledger) -> list[str]:
-    """Return lines on the fixed worlds, and on settings that the stopping rule has ended early."""
+    """Return lines on a campaign's worlds, and on settings that the stopping rule has ended early.
+
+    The former name the fixed worlds, or those of an export, and the fixed worlds in which no golden
+    flight has succeeded.
+    """
     spec = stored_spec(ledger)
+    worlds = spec.describe_worlds() if spec else ""
+    if ledger.export is not None:
+        table = flown(flights(ledger))
+        places = (table[name].to_pylist() for name in ("world", "world_seed"))
+        worlds = Flights.population_of(zip(*places, strict=True))
     return [
-        *filter(None, [spec.describe_worlds() if spec else ""]),
+        *filter(None, [worlds]),
+        *_lost_worlds(ledger),
         *(f"stopped early, because known well enough: {name}" for name in stopped(ledger)),
+    ]
+
+
+def _lost_worlds(ledger: Ledger) -> list[str]:
+    """Return a line for each fixed world that has golden flights, none of which succeeded."""
+    golden = {
+        number: outcome == Outcome.SUCCESS.value
+        for number, (outcome, fate) in sorted(ledger.fates(errors=False))
+        if fate == Injected.GOLDEN.value
+    }
+    won: dict[tuple[str, int], list[bool]] = defaultdict(list)
+    for success, config in zip(golden.values(), ledger.configs([*golden]), strict=True):
+        if config.world_seed is not None:
+            won[config.world, config.world_seed].append(success)
+    return [
+        f"world {world}, seed {seed}: no golden flight succeeded ({len(own)} flown), so faults "
+        "there show nothing"
+        for (world, seed), own in won.items()
+        if not any(own)
     ]
 
 

@@ -43,6 +43,9 @@ def test_the_library_reads_it():
 def test_its_commands_say_what_those_of_its_folder_say(mavfi, tmp_path):
     short = mavfi("campaign", "status", EXPORT)
     assert short.stdout.startswith("numbers: 640 missions"), short.stderr
+    worlds = "worlds: fixed (dense 3) in 320 flights, another one for each seed in 320; "
+    for status in (short, mavfi("campaign", "status", EXPORT, "--full")):
+        assert status.stdout.splitlines()[1].startswith(worlds)
     full = json.loads(mavfi("campaign", "status", EXPORT, "--json", "--quality").stdout)
     assert full["missions"] == 640
     table = mavfi("campaign", "report", EXPORT, "--format", "csv").stdout

@@ -9,9 +9,13 @@ import pytest
 from mavfi_cli.campaigns import begin as beginning
 from mavfi_cli.campaigns.begin import SEARCH, begin, stored_spec
 from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.specification import FixedWorld
 from mavfi_cli.campaigns.specification_file import PRESETS, load_spec, parse_spec, replaced
 from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.report.campaign import CampaignReport, state_lines
+from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 SPEC = """
 name = "mine"
@@ -154,6 +158,39 @@ def test_a_world_of_the_rule_that_no_mission_flies_is_refused(tmp_path):
         load_spec(str(file))
     file.write_text(SPEC)
     assert load_spec(str(file)).fixed_world.worlds == ("rising",)
+
+
+def test_a_named_world_that_no_mission_flies_is_refused(tmp_path):
+    file = tmp_path / "mine.toml"
+    named = SPEC.replace("[[setting]]", "[fixed_world.world_seed]\n{}\n[[setting]]", 1)
+    file.write_text(named.format("flst = 3"))
+    with pytest.raises(UnknownName, match=r"world of \[fixed_world\] 'flst'; did you mean 'flat'"):
+        load_spec(str(file))
+    file.write_text(named.format("dense = 3"))  # a world, but not of these missions
+    with pytest.raises(UnknownName, match=r"\[fixed_world\] 'dense'"):
+        load_spec(str(file))
+    file.write_text(named.format("flat = 3\ndense = 10"))  # as the shipped table has it
+    assert load_spec(str(file)).fixed_world.world_seed == {"flat": 3, "dense": 10}
+
+
+def test_a_fixed_world_without_a_successful_golden_flight_is_named(campaign):
+    def lines(*outcomes, **config):
+        missions = [
+            PlannedMission(config=MissionConfig(world=f"end:{outcome}", seed=seed, **config))
+            for seed, outcome in enumerate(outcomes, start=1)
+        ]
+        with campaign.run(missions, append=True) as ledger:
+            return state_lines(ledger), CampaignReport.of(ledger).as_dict().get("lost_worlds")
+
+    assert lines("collision", "collision") == ([], None)  # another world for each seed
+    own, in_json = lines("success", "collision", "collision", world_seed=4)
+    assert own == in_json
+    assert own == [
+        "world end:collision, seed 4: no golden flight succeeded (2 flown), so faults there show "
+        "nothing"
+    ]
+    struck = FaultConfig(target="waypoint_x")
+    assert lines("timeout", world_seed=4, fault=struck) == (own, own)  # no golden flight to judge
 
 
 def test_the_rule_comes_back_as_it_was():
