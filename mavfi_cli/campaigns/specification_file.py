@@ -23,6 +23,7 @@ from mavfi_cli.core.config import (
 )
 from mavfi_cli.core.errors import ConfigError, UnknownName, named_member
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
+from mavfi_cli.spec.mission import LIMITS
 
 PRESETS = Shipped("campaign", Path(__file__).parent / "presets")
 _FIXED_WORLDS = Shipped("fixed worlds", Path(__file__).parent / "fixed_worlds")
@@ -83,7 +84,7 @@ def _read_spec(data: Factors, path: Path, text: str = "") -> Spec:
     values: dict[str, Any] = {
         "name": path.stem,
         **{name: value for name, value in data.items() if name not in _FACTORS},
-        "fixed": mission,
+        "fixed": {name: _meant(name, value) for name, value in mission.items()},
         "axes": _axes(factors, "factors", path),
         "settings": axes_of_settings,
     }
@@ -123,17 +124,23 @@ def _axes(table: Factors, place: str, path: Path) -> Axes:
         key, several = f"{place}.{name}", isinstance(value, list)
         if name in LISTS:
             several = several and any(isinstance(item, list) for item in value)
-        values = tuple(value) if several else (value,)
-        for item in values:
+        given = value if several else [value]
+        for item in given:
             _require_usable(name, item, key, path)
-        if name == "planner":  # so that aliases of one planner count as one value
-            values = tuple(canonical_planner(v) if isinstance(v, str) else v for v in values)
+        values = tuple(_meant(name, item) for item in given)  # two spellings count as one value
         if name not in LISTS and not values:
             raise ConfigError("must have at least one value, got []", path=path, key=key)
         if name not in LISTS and len(set(map(repr, values))) < len(values):
             raise ConfigError(f"must not list a value twice, got {[*values]}", path=path, key=key)
         axes[name] = values
     return axes
+
+
+def _meant(name: str, value: Any) -> Any:
+    """Return a factor's value without other spellings: names of a planner, and `never`."""
+    if name == "planner" and isinstance(value, str):
+        return canonical_planner(value)
+    return LIMITS[name][1] if (name, value) == ("node_restart_s", "never") else value
 
 
 _ODD = re.compile(r"[^\w.+=-]+")  # unsuitable for a folder's name

@@ -136,8 +136,8 @@ _detector, _output = section("Detector"), section("Output")
 @_fault("--duration", "duration_s", type=types.ABOVE_ZERO,
         help="Duration of a stuck-at or intermittent fault, or of stop and slow, s  [until the "
              "end].")  # fmt: skip
-@_fault("--restart", "node_restart_s", default=1.0,
-        help="Time until a dead node works again, s; 3600 means never.")  # fmt: skip
+@_fault("--restart", "node_restart_s", type=types.RESTART, default=1.0,
+        help="Time until a dead node works again, s; never means 3600.")  # fmt: skip
 @_instruction("--level", type=click.Choice(["source", "instruction"]), default="source",
               help="`instruction` corrupts an operand of one machine instruction of a kernel. "
                    "--inject is then point_cloud, octomap, collision_check, planner, control, "

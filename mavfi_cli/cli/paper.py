@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from mavfi_cli.cli.grouped import GroupedCommand, given_fields, option, refuse_given, section
-from mavfi_cli.cli.types import ABOVE_ZERO, COMPAT, ITEM, JOBS, OUT, STACK, UPSETS
+from mavfi_cli.cli.types import ABOVE_ZERO, COMPAT, ITEM, JOBS, OUT, RESTART, STACK, UPSETS
 from mavfi_cli.core.option_types import Number, OutFile
 from mavfi_cli.core.terminal import echo, echo_lines, note
 
@@ -29,9 +29,9 @@ _output = section("Output")
 @_what("--worlds", type=click.Choice(["fixed", "many"]), default="fixed",
        help="Fly one fixed world of each environment, as the paper does, or another world for each "
             "seed.")  # fmt: skip
-@_what("--restart", "node_restart_s", type=Number(0.0, 3600.0), default=1.0,
-       help="Time until a node that died of a fault in an instruction works again, s; 3600 means "
-            "never.")  # fmt: skip
+@_what("--restart", "node_restart_s", type=RESTART, default=1.0,
+       help="Time until a node that died of a fault in an instruction works again, s; never means "
+            "3600.")  # fmt: skip
 @_what("--compat", type=COMPAT, metavar="INJECTOR",
        help="Choose operands and bits of faults in instructions as another injector: pinfi, "
             "pinfi-bugs, rosfi-2021.")  # fmt: skip

@@ -31,6 +31,7 @@ CONFIDENCE = Number(0.0, 1.0, min_open=True, max_open=True)
 SHARE, SCALE = Number(0.0, 1.0), Number(0.0, 1000.0, min_open=True)
 NUMBER = click.IntRange(0, MISSIONS.max)  # of a mission in its campaign
 UPSETS = Number(0.0, 1.0e12)
+RESTART = Number(0.0, 3600.0, words={"never": 3600.0})  # s, until a dead node works again
 PLACE = Place()
 
 # Names --------------------------------------------------------------------------------------------

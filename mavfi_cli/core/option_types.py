@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,25 @@ class Number(click.FloatRange):
     """The type of an option that takes a number within bounds.
 
     Unlike click's own range, it rejects NaN.
+
+    Args:
+        limits: smallest and largest number.
+        words: words that stand for numbers, keyed by word.
     """
+
+    def __init__(self, *limits: Any, words: Mapping[str, float] | None = None, **how: Any) -> None:
+        super().__init__(*limits, **how)
+        self._words = words or {}
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """Convert the value as click does, and fail if it is NaN."""
-        number = float(super().convert(value, param, ctx))
+        """Convert a word, or a value as click does, and fail if it is NaN."""
+        try:
+            number = float(super().convert(self._words.get(value, value), param, ctx))
+        except click.BadParameter as error:
+            meanings = (f" {word!r} means {own:g}." for word, own in self._words.items())
+            self.fail(f"{error.message}{''.join(meanings)}", param, ctx)
         return self.fail(f"{value} is not a number.", param, ctx) if number != number else number
 
 

@@ -106,7 +106,8 @@ class MissionConfig:
         fault: Source-level fault to inject; None for a golden run.
         instruction: Instruction-level fault to inject; None for a golden run.
         detector: Detector that checks messages before they take effect; None for no detector.
-        node_restart_s: Simulated time from the death of a node to its restart, s.
+        node_restart_s: Simulated time from the death of a node to its restart, s; 3600 means never,
+            which a campaign's file may also write as "never".
         node_watchdog_s: Simulated time after which a busy node counts as hung and is killed, s.
         isolate: Nodes that run in processes of their own; does not change the record.
         companion: TOML file or command line of a user's companion, which flies in place of mavfi's.

@@ -82,6 +82,8 @@ def test_a_place_where_nobody_can_be(refused, arguments, said):
         (("--seed", "-1"), "--seed: must be between 0 and 2147483647"),
         (("--inject", "planning", "--fault-seed", "-1"), "Invalid value for '--fault-seed'"),
         (("--inject", "planning", "--bit", "64"), "Invalid value for '--bit': 64 "),
+        (("--restart", "soon"), "Invalid value for '--restart': 'soon' is not a valid"),
+        (("--restart", "4000"), "Invalid value for '--restart': 4000.0 is not in the range"),
         (("--goal", "1e9,0,5"), "--goal: must be within 1e+07 m"),
         (("--goal", "nan,1,2"), "Invalid value for '--goal': must be three finite"),
         (("--start", "1,inf,2"), "Invalid value for '--start': must be three finite"),

@@ -13,6 +13,7 @@ from mavfi_cli.cli.types import Name
 from mavfi_cli.core.option_types import OutFile, OutFolder
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.paper import flying
+from mavfi_cli.spec.mission import LIMITS
 from mavfi_cli.studies import compare
 from mavfi_cli.studies.compare import ComparePlan
 from mavfi_cli.studies.evaluate import EvaluationPlan
@@ -172,6 +173,13 @@ def test_the_shell_completes_run_folders_and_campaigns(completed, tmp_path):
     assert completed("show ") == completed("replay run") == ["runs/farm-3-001", "runs/farm-3-002"]
     assert completed("view runs/farm-3-001") == ["runs/farm-3-001"]
     assert completed("campaign status camp") == ["campaigns/mine"]
+
+
+@pytest.mark.parametrize("words", [("fly",), ("reproduce",)])
+def test_never_is_the_longest_time_until_a_restart(words):
+    (command,) = [command for known, command in _leaves(cli.cli) if known == words]
+    given = command.make_context("mavfi", ["--restart", "never"]).params
+    assert given["node_restart_s"] == LIMITS["node_restart_s"][1]
 
 
 PLANS = [
