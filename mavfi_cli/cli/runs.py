@@ -131,12 +131,13 @@ def _repeat_run(
     again = fly_again(run, out, **flown, for_debugger=_announce_stop if gdb else None)
     ignored = _ACTIVATION_SECTIONS if gdb else ()
     differing = [name for name in run.differing_sections(again) if name not in ignored]
-    identical = not differing and (file_digest(run.folder.trace) == file_digest(again.folder.trace))
+    if file_digest(run.folder.trace) != file_digest(again.folder.trace):
+        differing.append("trace")
     parting = run.first_difference(again, truth=True)
     comparison = {
         "run": str(run.folder.path),
         "again": str(again.folder.path),
-        "identical": identical,
+        "identical": not differing,
         "outcomes": [run.record.outcome, again.record.outcome],
         "differing_sections": differing,
         "first_difference": parting and {"stamp_s": parting.stamp_s, "column": parting.column},
@@ -149,7 +150,9 @@ def _repeat_run(
             "",
         ]
     else:
-        lines = ["identical"] if identical else ["DIFFERENT", *difference_lines(run, again)]
+        lines = [f"DIFFERENT in {', '.join(differing)}" if differing else "identical"]
+        if run.first_difference(again) is not None:
+            lines += difference_lines(run, again)
     return comparison, [*lines, f"Run folder  {again.folder.path}"]
 
 

@@ -507,7 +507,7 @@ def load_run(path: str | Path) -> Run:
         raise RecordError(f"{folder.result}: the file was written by another version of mavfi")
     if missing := [key for key in _NEEDED if key not in result]:
         raise RecordError(f"{folder.result}: the file is damaged (missing: {', '.join(missing)})")
-    # Runs recorded before stacks were introduced used the stack FIRST.
+    # A setting that an older record lacks had its default. Without a stack, the stack was FIRST.
     with reading(folder.result):
-        result["config"] = {"stack": FIRST, "world_seed": None, **result["config"]}
+        result["config"] = {**MissionConfig().to_dict(), "stack": FIRST, **result["config"]}
     return Run(folder, result, trace)

@@ -139,6 +139,19 @@ def copied(short_flight, tmp_path):
     return folder
 
 
+def test_a_replay_names_what_differs_from_the_record(command_line, copied):
+    result = json.loads((copied / "result.json").read_text())
+    del result["config"]["node_restart_s"]  # an older version did not record it
+    (copied / "result.json").write_text(json.dumps(result))
+    code, out, _ = command_line("replay", copied)
+    assert (code, out.splitlines()[0]) == (0, "identical")
+    result["pilot"]["replans"] += 1
+    (copied / "result.json").write_text(json.dumps(result))
+    code, out, _ = command_line("replay", copied)
+    assert (code, out.splitlines()[0]) == (1, "DIFFERENT in pilot")
+    assert "nothing else ever differs" not in out
+
+
 def _change(folder, section, value):
     path = folder / "result.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {section: value}))
