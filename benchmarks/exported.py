@@ -14,7 +14,9 @@ from mavfi_cli.stats.shares import Share, clustered_share, wilson
 
 Row = Mapping[str, Any]
 Key = tuple[Any, ...]
-PAIRED = ("world", "world_seed", "seed", "stack", "platform")  # of a mission and its golden flight
+_MANY = 4  # replans of a golden flight; few flights have more
+# What a mission and its golden flight share.
+PAIRED = ("world", "world_seed", "seed", "stack", "platform", "planner")
 
 
 def arguments(text: str | None, by: Sequence[str] | None = None) -> argparse.ArgumentParser:
@@ -32,9 +34,27 @@ def arguments(text: str | None, by: Sequence[str] | None = None) -> argparse.Arg
 
 
 def flown(parts: list[str]) -> list[Row]:
-    """Return the flown missions of all exports, one row per mission."""
+    """Return the flown missions of all exports, one row per mission.
+
+    Each row also has `golden_replans`: how often the mission's golden flight without a detector
+    replanned ("4 or more" is one value), or "golden lost" if that flight failed. It is empty
+    without such a flight.
+    """
     rows = [row for part in parts for row in pq.read_table(part).to_pylist()]
-    return [row for row in rows if row["state"] == "flown"]
+    rows = [row for row in rows if row["state"] == "flown"]
+    replans = {
+        key(row, PAIRED): _replans(row)
+        for row in rows
+        if row["injected"] == "golden" and not row.get("detector")
+    }
+    return [row | {"golden_replans": replans.get(key(row, PAIRED), "")} for row in rows]
+
+
+def _replans(golden: Row) -> str:
+    if lost(golden):
+        return "golden lost"
+    count = golden["replans"]
+    return "" if count is None else "4 or more" if count >= _MANY else str(count)
 
 
 def key(row: Row, names: tuple[str, ...]) -> Key:

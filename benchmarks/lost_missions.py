@@ -2,13 +2,15 @@ r"""Counts the lost and the longer missions of flown campaigns, per cell.
 
     python benchmarks/lost_missions.py docs/results/effects-part*.parquet \
         --by label_setting world label_field
+    python benchmarks/lost_missions.py docs/results/paper-mavbench.parquet \
+        --by level detector planner golden_replans
 
 Reads exports of campaigns (`mavfi campaign export`). A cell counts golden missions, and missions
 whose fault was read. A mission is lost if it does not end in success. It is longer if it succeeds
 and takes more than 10 % longer than its own golden flight: the flight without a fault with the same
 world, world seed, seed, stack and platform, and without a detector. The last column counts the
-missions with an alarm of a detector, and the alarms per hour of flight. Intervals are Wilson's,
-95 %.
+missions with an alarm of a detector, and the alarms per hour of flight. `golden_replans` groups by
+how often the golden flight without a detector replans. Intervals are Wilson's, 95 %.
 """
 
 from __future__ import annotations
