@@ -8,8 +8,9 @@ is lost if it does not end in success. The effect of a factor is the share of mi
 second level loses, minus that of its first level, as a mean over worlds and seeds. Intervals are
 bootstrap intervals over worlds and seeds, 95 %.
 
-Faults of one seed are drawn alike in all worlds and on all stacks. "p by seed" and the last table,
-which were not part of the rule, therefore count each seed once.
+Faults of one seed are drawn alike in all worlds and on all stacks. "p by seed" and the last two
+tables, which were not part of the rule, therefore count each seed once. The last table has all 32
+combinations.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from exported import PAIRED, Key, Row, flown, golden_lost, key, lost, share
 from mavfi_cli.paper.items import printed
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import holm, sign_flips
-from mavfi_cli.stats.shares import Interval
+from mavfi_cli.stats.shares import Interval, clustered_share
 
 Cells = dict[tuple[bool, ...], list[bool]]  # whether each mission was lost, by levels
 PAPER_LOSS = 100.0 * (380 / 400 - 1058 / 1200)  # Table IV, all worlds: golden minus faults
@@ -111,21 +112,43 @@ def main() -> None:
         )
         print(f"| {name} | {' | '.join(cells)} |")
 
-    print("\n| " + " | ".join(names := ["worlds", "dead nodes", "injector"]) + " | lost | % |")
-    print("|---" * 5 + "|")
+    for names in (["worlds", "dead nodes", "injector"], [*FACTORS]):
+        print("\n".join(losses(blocks, names)))
+
+
+def losses(blocks: Mapping[Key, Cells], names: list[str]) -> list[str]:
+    """Return a table of the missions lost at each combination of levels of the named factors.
+
+    The first percentage counts each seed once, with its bootstrap interval, which has no width if
+    nothing was lost. The second is that of all missions, with Wilson's interval and each seed as a
+    cluster. The last column is the second minus the paper's.
+    """
+    titles = [*names, "lost", "% (bootstrap)", "% (Wilson)", "minus the paper's, points"]
+    lines = ["", f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     places = [[*FACTORS].index(name) for name in names]
-    for chosen in itertools.product((False, True), repeat=3):
+    for chosen in itertools.product((False, True), repeat=len(names)):
         cells = {
             where: [hit for corner, hits in block.items() for hit in hits
                     if tuple(corner[place] for place in places) == chosen]
             for where, block in blocks.items()
         }  # fmt: skip
-        hits = [hit for cell in cells.values() for hit in cell]
-        rates = interval(100.0 * np.array(of_seeds(
-            {where: float(np.mean(cell)) for where, cell in cells.items() if cell}
-        )))  # fmt: skip
+        hits = [(hit, ("seeds", seed)) for (_, seed), cell in cells.items() for hit in cell]
+        whole = clustered_share(*zip(*hits, strict=True), {})
+        by_seed = of_seeds({where: float(np.mean(cell)) for where, cell in cells.items() if cell})
+        own, beyond = (
+            Interval(
+                value=100.0 * whole.share - less,
+                low=100.0 * whole.low - less,
+                high=100.0 * whole.high - less,
+                count=whole.total,
+            )
+            for less in (0.0, PAPER_LOSS)
+        )
+        rates = interval(100.0 * np.array(by_seed))
+        numbers = text(rates, ""), text(own, ""), text(beyond, "+")
         ends = [FACTORS[name][level] for name, level in zip(names, chosen, strict=True)]
-        print(f"| {' | '.join(ends)} | {sum(hits)} of {len(hits)} | {text(rates, '')} |")
+        lines.append(f"| {' | '.join((*ends, f'{whole.count} of {whole.total}', *numbers))} |")
+    return lines
 
 
 def paper_loss(world: str) -> float:
