@@ -8,11 +8,13 @@ what faults cost a user's companion.
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
+from statistics import stdev
 from typing import Any, NamedTuple
 
 from mavfi_cli.analysis.pairs import STRUCK, USUAL, Fate, Flights, back
@@ -22,8 +24,9 @@ from mavfi_cli.core.types import BY_NAME, DType
 from mavfi_cli.paper.items import Regime, printed
 from mavfi_cli.report.paper import Printed
 from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
 from mavfi_cli.stats.paired import McNemar, holm
-from mavfi_cli.stats.shares import Share, cross_layer, wilson
+from mavfi_cli.stats.shares import Interval, Share, cross_layer, wilson
 
 Row = Mapping[str, Any]  # one flight
 
@@ -396,6 +399,7 @@ class CompanionArm:
     """Flights of a user's companion with one kind of fault, without the gate or with it.
 
     Most of these flights are not repeatable, so arms are compared as independent samples.
+    `means` and `differences` have the keys `flight_time_s` and `distance_m`.
 
     Attributes:
         companion: the companion's file, the autopilot if it is not mavfi's own, and the world.
@@ -404,6 +408,11 @@ class CompanionArm:
         gate: the gate's detector, model and threshold; empty without a gate.
         lost: share of lost flights: of all, of the silent faults (read, and no process ended), and
             of those that ended a process. Without a fault, it has only the share of all.
+        golden: the companion's flights with neither a fault nor a gate; None if there are none, and
+            for these flights themselves.
+        means: mean over the successful flights, with its interval; flight time in s, distance in m.
+        deviations: standard deviation of the same values; NaN if there are fewer than two.
+        differences: mean minus that of `golden`, with Welch's interval; empty without `golden`.
         alarmed: share of flights in which the gate raised an alarm; None without a gate.
         hours: duration of all flights together.
         p_value: p-value of Fisher's exact test of all lost flights against those without a gate,
@@ -415,6 +424,10 @@ class CompanionArm:
     fault: str
     gate: str
     lost: Mapping[Fate, Share]
+    golden: CompanionArm | None
+    means: Mapping[str, Interval]
+    deviations: Mapping[str, float]
+    differences: Mapping[str, Interval]
     alarmed: Share | None
     hours: float
     p_value: float | None = None
@@ -427,17 +440,19 @@ def companion_arms(flights: Flights) -> list[CompanionArm]:
     """
     mine = flights.chosen(injected=(Injected.GOLDEN.value, *STRUCK))
     mine = mine.where(name is not None for name in mine["companion"])
-    found = {
-        key: _companion_arm(key, those)
-        for key, those in mine.grouped(map(_arm_key, mine["changes"])).items()
-    }
+    by_arm = mine.grouped(map(_arm_key, mine["changes"]))
+    goldens = {key: those for key, those in by_arm.items() if not (key.fault or key.gate)}
+    found: dict[_ArmKey, CompanionArm] = {}
+    for key in sorted(by_arm):  # golden flights come first
+        own = key._replace(fault="", gate="")
+        found[key] = _companion_arm(key, by_arm[key], goldens.get(own), found.get(own))
     tested = {
         key: plain.lost[Fate.ALL].fisher(arm.lost[Fate.ALL])
         for key, arm in found.items()
         if key.fault and key.gate and (plain := found.get(key._replace(gate="")))
     }
     corrected = dict(zip(tested, holm([*tested.values()]), strict=True))
-    return [replace(found[key], p_value=corrected.get(key)) for key in sorted(found)]
+    return [replace(arm, p_value=corrected.get(key)) for key, arm in found.items()]
 
 
 class _ArmKey(NamedTuple):
@@ -468,15 +483,31 @@ _WORLD = MissionConfig().world
 _UNNAMED = ("target", "seed", "invocation_seed")  # fields of a fault that tell no kinds apart
 
 
-def _companion_arm(key: _ArmKey, flights: Flights) -> CompanionArm:
+def _companion_arm(
+    key: _ArmKey, flights: Flights, own: Flights | None, golden: CompanionArm | None
+) -> CompanionArm:
     alarms = [bool(count) for count in flights["alarm_count"]]
     fates = {Fate.ALL: flights}
     if key.fault:
         fates[Fate.SILENT] = flights.chosen(ended=False, activation="read")
         fates[Fate.DEAD] = flights.chosen(ended=True)
+    values = {name: flights.chosen(lost=False).known(name) for name in _COMPANION_MEASURES}
     return CompanionArm(
         **key._asdict(),
         lost={fate: those.share() for fate, those in fates.items()},
+        golden=golden,
+        means={name: interval(mine, resamples=TABLE_RESAMPLES) for name, mine in values.items()},
+        deviations={
+            name: stdev(mine.tolist()) if len(mine) > 1 else math.nan
+            for name, mine in values.items()
+        },
+        differences={
+            name: Interval.welch(own.chosen(lost=False).known(name), mine)
+            for name, mine in values.items()
+        } if own and golden else {},
         alarmed=wilson(sum(alarms), len(alarms)) if key.gate else None,
         hours=float(flights.known("flight_time_s").sum()) / 3600.0,
-    )
+    )  # fmt: skip
+
+
+_COMPANION_MEASURES = ("flight_time_s", "distance_m")

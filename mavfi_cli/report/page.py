@@ -17,7 +17,7 @@ from mavfi_cli.campaigns.specification import Spec
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import require_output
 from mavfi_cli.report.paper import DETECTOR_TITLES
-from mavfi_cli.report.table import percent, rate, with_ends
+from mavfi_cli.report.table import number, percent, rate, spread, with_ends
 from mavfi_cli.stats.shares import Interval
 
 _FOLDER = Path(__file__).parent
@@ -101,7 +101,8 @@ def _link(text: str) -> str:
 
 FILTERS: Mapping[str, Callable[..., Any]] = {
     "percent": percent, "rate": rate, "ends": with_ends, "effect": _effect, "p": _p_value,
-    "range": _range,
+    "range": _range, "number": lambda value: number(value, ".2f"),
+    "spread": lambda value, sign="": spread(value, 2, sign=sign),
     "link": _link, "toml": Spec.to_toml,
     "detector": lambda name: DETECTOR_TITLES.get(name, name) if name else "none",
     "missions": lambda count: f"{math.ceil(count):,}" if math.isfinite(count) else "",

@@ -1,5 +1,7 @@
 """From kernel to mission, where a bit hurts, failures an hour, and the arms of a campaign."""
 
+import math
+
 import pytest
 from made_flights import flights, row
 
@@ -226,3 +228,27 @@ def test_a_users_companion_is_counted_with_and_without_its_gate():
     assert found["fly/server", "gad"].p_value < 1e-9
     assert found["fly/server", ""].p_value is None
     assert found["fly/other", "gad"].p_value is None  # not flown without the gate
+
+
+def test_times_of_a_users_companion_stand_beside_the_spread_of_its_golden_flights():
+    config = {"companion": "fly.toml"}
+    rows = [
+        row(seed=1, config=config, time_s=20.0, distance_m=10.0),
+        row(seed=2, config=config, time_s=22.0, distance_m=12.0),
+        row(seed=3, config=config, detector="gad", time_s=25.0),
+        row("fly", seed=4, instruction=True, config=config, time_s=24.0, distance_m=15.0),
+        row("fly", seed=5, instruction=True, config=config, time_s=28.0, distance_m=15.0),
+        row("fly", seed=6, instruction=True, config=config, **LOST, distance_m=99.0),
+        row("fly", seed=7, instruction=True, config={"companion": "other.toml"}),
+    ]
+    golden, gated, faulty, alone = companion_arms(flights(rows))
+    assert golden.golden is alone.golden is None
+    assert gated.golden == faulty.golden == golden
+    assert (golden.means["flight_time_s"].value, golden.means["distance_m"].value) == (21.0, 11.0)
+    assert golden.deviations["flight_time_s"] == pytest.approx(math.sqrt(2.0))
+    assert (faulty.means["flight_time_s"].count, faulty.means["flight_time_s"].value) == (2, 26.0)
+    difference = faulty.differences["flight_time_s"]
+    assert (difference.value, difference.low < 0.0 < difference.high) == (5.0, True)
+    assert faulty.differences["distance_m"].value == 4.0
+    assert math.isnan(gated.deviations["flight_time_s"])
+    assert alone.differences == {}

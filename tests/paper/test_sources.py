@@ -369,12 +369,16 @@ def test_missions_of_another_paper_are_said_to_judge_nothing(export):
 def test_a_page_of_users_companions_shows_nothing_of_the_paper(export):
     config = {"companion": "fly.toml"}
     mine = {"instruction": True, "config": config}
-    rows = [row(config=config), row("fly/server", **mine, outcome="crash")]
+    rows = [row(config=config, seed=seed, time_s=18.0 + seed) for seed in (1, 3)]
+    rows += [row("fly/server", **mine, outcome="crash"), row("fly/server", **mine, seed=2)]
     found = Evidence.gather([export("one.parquet", *rows)])
     assert not any("golden" in problem or "paper" in problem for problem in found.problems)
     page = render(document(found))
     assert "fly/server" in page
-    assert "1 of 1, 100" in page
+    assert "1 of 2, 50" in page
+    assert "The fault repeats and the flight does not" in page
+    assert "20.00, SD 1.41" in page  # the golden flights, beside those with a fault
+    assert "to the byte" not in page
     assert 'id="claims"' not in page
     assert 'id="problems"' in page
     both = Evidence.gather([export("two.parquet", *rows, row(seed=9))])
