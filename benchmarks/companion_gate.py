@@ -6,7 +6,8 @@ r"""Counts the flights of a user's companion that faults lose, with and without 
 
 Reads exports of campaigns (`mavfi campaign export`) with golden flights, null faults, and faults in
 instructions or messages. A fault struck if the record has its activation. It is dead if its process
-ended, and silent if it was read and its process did not end. A process that a program has started
+ended, and silent if it was read and its process did not end. The others were neither read nor
+overwritten within the instructions that mavfi follows. A process that a program has started
 and that ends with an exit code is not dead if the flight succeeds, because the program ended
 without an error. A flight is lost if it does not end in success. Intervals are Wilson's, 95 %; p is
 that of Fisher's exact test. --by adds the lost flights by one column, or by several together, with
@@ -56,11 +57,13 @@ def main() -> None:
     _compare("dead", [[*map(_dead, side)] for side in struck], counts=True)
     for name, kind in (("dead", _dead), ("silent", _silent)):
         _compare(f"lost, of the {name}", [[*map(lost, filter(kind, side))] for side in struck])
-    overwritten = [[row for row in side if row["activation"] == "overwritten"] for side in struck]
-    _compare("lost, of the overwritten", [[*map(lost, side)] for side in overwritten])
+    for name, kind in (("overwritten", _overwritten), ("others", _unknown)):
+        _compare(f"lost, of the {name}", [[*map(lost, filter(kind, side))] for side in struck])
     alarmed = [row for row in struck[1] if row["alarm_count"]]
     print(f"\nAlarms in {len(alarmed)} of {len(struck[1])} struck flights with the gate, ", end="")
     print(f"of which {sum(map(lost, alarmed))} were lost.")
+    failed = sum(not row["node_ended"] for side in struck for row in filter(_dead, side))
+    print(f"{failed} of the dead count because their program failed.")
     if options.by:
         _by(options.by, struck)
 
@@ -93,6 +96,14 @@ def _dead(row: Row) -> bool:
 
 def _silent(row: Row) -> bool:
     return row["activation"] == "read" and not _dead(row)
+
+
+def _overwritten(row: Row) -> bool:
+    return bool(row["activation"] == "overwritten")
+
+
+def _unknown(row: Row) -> bool:
+    return row["activation"] not in ("read", "overwritten")
 
 
 def _alarms(rows: list[Row]) -> str:
