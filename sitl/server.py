@@ -105,7 +105,8 @@ class Client(Peer):
             messages = self._codec.decode(data, datagram=self.transport.datagram)
             for message in messages:
                 if message.get_msgId() in _COMMANDS:
-                    self._offer_camera(message)
+                    if self._offer_camera(message):
+                        continue
                 elif message.get_msgId() == dialect.MAVLINK_MSG_ID_STATUSTEXT:
                     self.texts.append(bytes(message.get_msgbuf()))
                 self._simulation.handle(message, self.link)
@@ -150,11 +151,31 @@ class Client(Peer):
             self.transport.send(b"".join(frames))
         return bool(frames)
 
-    def _offer_camera(self, message: Any) -> None:
-        answers = self._simulation.camera.handle(message)
-        self._camera_answers += answers
-        if not answers or answers[-1].result != dialect.MAV_RESULT_ACCEPTED:
-            return
+    def _offer_camera(self, message: Any) -> bool:
+        """Offer a command to the camera. Return True if the autopilot is not to get it.
+
+        The camera answers in the autopilot's name if the autopilot is asked for ranges, because
+        clients such as MAVSDK ask only the autopilot. Real firmware answers for itself.
+        """
+        for_autopilot = (
+            isinstance(self._simulation.autopilot, Autopilot)
+            and (message.target_system, message.target_component) == (self._codec.system, COMPONENT)
+            and message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL
+            and message.param1 in SENSORS
+        )
+        component = COMPONENT if for_autopilot else CAMERA
+        answers = self._simulation.camera.handle(message, component=component)
+        if for_autopilot:
+            for answer in answers:
+                self.link.send(answer)
+        else:
+            self._camera_answers += answers
+        if answers and answers[-1].result == dialect.MAV_RESULT_ACCEPTED:
+            self._choose(message)
+        return for_autopilot
+
+    def _choose(self, message: Any) -> None:
+        """Note which camera messages the client gets after a command that the camera accepted."""
         if message.command == dialect.MAV_CMD_IMAGE_START_CAPTURE:
             self._unwanted -= _FRAMES
         elif message.command == dialect.MAV_CMD_IMAGE_STOP_CAPTURE:

@@ -127,20 +127,23 @@ class Camera:
         self._depth, self._streamed = depth, _Schedule(self._default_interval_s)
         self._sensors: dict[int, _Schedule] = {}  # those requested by a client, by message id
 
-    def handle(self, message: Message) -> list[Message]:
+    def handle(self, message: Message, *, component: int = COMPONENT_ID) -> list[Message]:
         """Handle a message, and return the answers to it.
 
         The list is empty if the message is not a command for this camera, or is a command for all
         components that the camera refuses.
+
+        Args:
+            component: Component for which the camera answers.
         """
         kind = message.get_type()
         if kind not in ("COMMAND_LONG", "COMMAND_INT") or message.target_system != self.system:
             return []
-        if message.target_component not in (COMPONENT_ID, dialect.MAV_COMP_ID_ALL):
+        if message.target_component not in (component, dialect.MAV_COMP_ID_ALL):
             return []
         answers = self._command(message)
         # The autopilot also gets a broadcast command, so a refusal here would confuse the sender.
-        is_ours = message.target_component == COMPONENT_ID
+        is_ours = message.target_component == component
         return answers if is_ours or answers[-1].result == dialect.MAV_RESULT_ACCEPTED else []
 
     def poll(

@@ -11,6 +11,7 @@ import pytest
 from mavfi_cli.core.frames import quaternion_from_euler
 from mavfi_cli.link.codec import Codec, dialect
 from mavfi_cli.link.transport import memory_pair
+from sitl.autopilot.autopilot import COMPONENT
 from sitl.autopilot.telemetry import Preset
 from sitl.camera.component import COMPONENT_ID, Camera
 from sitl.camera.ranges import SENSORS
@@ -134,3 +135,25 @@ def test_only_the_client_that_requested_ranges_gets_them() -> None:
         client.send_tick()
     last = [[m.get_type() for m in Codec(0, 0).decode(link.receive(0.0))] for link, _ in links]
     assert [received.count("OBSTACLE_DISTANCE") for received in last] == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("interval_us", "result", "rings"),
+    [(100_000.0, dialect.MAV_RESULT_ACCEPTED, 5), (math.nan, dialect.MAV_RESULT_DENIED, 0)],
+)
+def test_the_autopilot_answers_a_request_for_ranges(
+    interval_us: float, result: int, rings: int
+) -> None:
+    simulation = Simulation(load_world("farm", seed=3), load_profile("solo"), logs=False)
+    ours, end = memory_pair("memory")
+    client = Client(simulation, end, preset=Preset.ONBOARD)
+    client.take(Codec(255, 190).encode(request(RING, interval_us, component=COMPONENT)))
+    received = []
+    for _ in range(25):
+        simulation.advance()
+        client.send_tick()
+        received += Codec(0, 0).decode(ours.receive(0.0))
+    acks = [message for message in received if message.get_type() == "COMMAND_ACK"]
+    assert [(ack.get_srcComponent(), ack.result) for ack in acks] == [(COMPONENT, result)]
+    kinds = [message.get_type() for message in received]
+    assert kinds.count("OBSTACLE_DISTANCE") == rings
