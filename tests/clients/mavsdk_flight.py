@@ -90,6 +90,8 @@ async def fly(address, port):
     up = await first(drone.telemetry.position(), lambda p: p.relative_altitude_m > 3.7)
     seen["altitude"] = up.relative_altitude_m
     await first(drone.telemetry.flight_mode(), lambda m: str(m) == "HOLD")
+    await drone.telemetry.set_rate_distance_sensor(5.0)
+    seen["longest_range"] = (await first(drone.telemetry.distance_sensor())).maximum_distance_m
     await fly_offboard(drone, seen)
     await drone.action.land()
     await first(drone.telemetry.landed_state(), lambda s: str(s) == "ON_GROUND")

@@ -33,6 +33,7 @@ def test_mavsdk_arms_takes_off_flies_offboard_and_lands(sitl, free_udp_port, fre
     assert seen["parameter"] == 3
     assert seen["parameters"] > 40
     assert seen["armed"]
+    assert seen["longest_range"] == 25.0
     assert seen["disarmed"]
     assert seen["mode_offboard"] == "OFFBOARD"
     assert seen["mode_after"] == "HOLD"
