@@ -79,7 +79,8 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--picture", type=Path, help="where to draw, as SVG")
     given = parser.parse_args()
-    found = arms(Evidence.gather([Path(each) for each in given.parts]).flights())
+    flights = Evidence.gather([Path(each) for each in given.parts]).flights()
+    (found,) = arms(flights, every=True).values()
     print("\n".join(lines(found)))
     if given.picture is not None:
         draw(found, given.picture)

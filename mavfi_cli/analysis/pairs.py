@@ -113,6 +113,7 @@ class Flights:
             states are those of the paper. Stack, detector model and `at` may differ. Unless a
             fault strikes a state, `restart_s` and `injector` may differ, too.
         struck: whether the fault flipped a bit, read or not, as in the paper's counts.
+        killed: whether the fault ended a process, which is no flip of a bit.
         lost: whether the mission did not end in success.
         ended: whether a node crashed or hung.
         restart_s: time after which a dead node is restarted; the default without a fault.
@@ -178,6 +179,26 @@ class Flights:
         kept = pa.array([not own for own in left_out], pa.bool_())
         return Flights(_beside_golden(self.table.select(_NOTHING_FLOWN.column_names).filter(kept)))
 
+    def beside_base(
+        self, pairs: Sequence[str], arms: Sequence[str | None], golden: Sequence[int]
+    ) -> Flights:
+        """Return the flights with protections as arms beside the flights without a protection.
+
+        An arm stands in the column `detector`, and watches all stages, so `balance` compares it as
+        it compares a detector.
+
+        Args:
+            pairs: a text for each flight, equal for flights that differ only in fault and arm.
+            arms: the arm of each flight, or None if it is unprotected.
+            golden: the index of each flight's golden flight, or -1 without one.
+        """
+        table = self.table.select(_NOTHING_FLOWN.column_names)
+        everywhere = [name and EVERY_STAGE for name in arms]
+        for column, values in (("pair", pairs), ("detector", arms), ("protect", everywhere)):
+            place = table.column_names.index(column)
+            table = table.set_column(place, column, pa.array(values, pa.string()))
+        return Flights(_beside_golden(table, np.array(golden, dtype=np.int64)))
+
     def __len__(self) -> int:
         return int(self.table.num_rows)
 
@@ -239,10 +260,11 @@ class Flights:
 
         Args:
             protect: stages that the detector watches, joined by `+`.
-            values: further conditions on columns, as in `chosen`.
+            values: further conditions on columns, as in `chosen`. They may replace that on
+                `bare_struck`.
         """
         seen = {"detector": detector, "protect": protect, "own_lost": False, "bare_struck": True}
-        return self.chosen(**seen, **values)
+        return self.chosen(**{**seen, **values})
 
     def of_fate(self, fate: Fate) -> Flights:
         """Return the flights without a fault, and those whose fault has this fate.
@@ -475,6 +497,7 @@ def _flown(table: pa.Table) -> pa.Table:
         at=pa.array(at, pa.string()),
         as_paper=pa.array(map(_as_paper, configs), pa.bool_()),
         struck=pc.and_not(flips, kills),
+        killed=pc.and_(flips, kills),
         lost=lost,
         ended=pc.is_valid(table["node_ended"]),
         restart_s=pa.array(map(_restart_s, configs), pa.float64()),
@@ -540,14 +563,20 @@ def _as_paper(config: Mapping[str, Any]) -> bool:
     return config.keys() <= known and changed <= _DRAWN and watch == PAPER
 
 
-def _beside_golden(table: pa.Table) -> pa.Table:
+def _beside_golden(table: pa.Table, golden: IntArray | None = None) -> pa.Table:
     """Add the columns that compare each flight with its golden and its unprotected flight.
 
     The class `Flights` describes these columns.
+
+    Args:
+        golden: the index of each flight's golden flight, of shape (n,), or -1 without one; None for
+            that of the same pair.
     """
     unprotected = pc.and_(pc.is_null(table["detector"]), pc.is_null(table["companion"]))
-    golden = pc.and_(unprotected, pc.equal(table["fault"], _NO_FAULT))
-    own = _places(partners(table, table, ("pair",), only=golden))
+    if golden is None:
+        unharmed = pc.and_(unprotected, pc.equal(table["fault"], _NO_FAULT))
+        golden = partners(table, table, ("pair",), only=unharmed)
+    own = _places(golden)
     fault = ("pair", "fault", "restart_s")
     bare = _places(partners(table, table, fault, only=unprotected))
     own_lost, own_time = (table[name].take(own) for name in ("lost", "flight_time_s"))

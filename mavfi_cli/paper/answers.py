@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby, product
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -23,10 +23,11 @@ from mavfi_cli.stats.shares import Share, wilson
 LEVELS = {"source": "states", "instruction": "instructions"}
 _DECIDED = 0.25  # an answer needs this share of decided claims, and no more open than decided ones
 _COMPUTER = "x86"  # platform of the answers; only the table of balances covers all platforms
-_KINDS = {  # kinds of faults: level, and effect on the struck node
-    "a wrong value in a state": ("source", Fate.ALL),
-    "a fault in an instruction, silent": ("instruction", Fate.SILENT),
-    "a fault in an instruction that ends its node": ("instruction", Fate.DEAD),
+_KINDS: Mapping[str, tuple[Mapping[str, Any], Fate]] = {  # columns, effect on the struck node
+    "a wrong value in a state": ({"level": "source"}, Fate.ALL),
+    "a fault in an instruction, silent": ({"level": "instruction"}, Fate.SILENT),
+    "a fault in an instruction that ends its node": ({"level": "instruction"}, Fate.DEAD),
+    "a killed process": ({"killed": True, "struck": False, "bare_struck": False}, Fate.ALL),
 }
 
 
@@ -257,7 +258,7 @@ class DetectorBalance:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Against:
-    """The effect of a detector, or of another stack, against one kind of fault.
+    """The effect of a protection, or of another stack, against one kind of fault.
 
     Attributes:
         effect: `helps`, `harms`, `no proven effect` or `nothing to undo`, by a test at LEVEL.
@@ -268,17 +269,25 @@ class _Against:
     counts: str
 
     @classmethod
-    def of_pairs(cls, balance: Balance) -> _Against | None:
-        """Judge a detector by McNemar's test on the same faults, or return None without pairs."""
-        if not balance.pairs:
+    def of_pairs(cls, harmed: Balance, lost: Balance) -> _Against | None:
+        """Judge a protection by McNemar's test of the harm by the same faults.
+
+        Return None without pairs.
+        """
+        if not harmed.pairs:
             return None
-        before, caused, pairs = balance.before, balance.caused, balance.pairs
-        counts = f"{balance.undone:,} of {before:,} undone, {caused:,} caused; {pairs:,} pairs"
-        ill = before + caused
-        proven = balance.p_value < LEVEL
-        if not ill:
-            counts = f"no harm in {pairs:,} pairs"
-        return cls(effect=_effect(ill, balance.undone > balance.caused, proven), counts=counts)
+        ill = harmed.before + harmed.caused
+        counts = f"no harm in {harmed.pairs:,} pairs"
+        if ill:
+            undone = {"harmed": harmed, "lost": lost}
+            parts = (
+                f"{name}: {own.undone:,} of {own.before:,} undone, {own.caused:,} caused"
+                for name, own in undone.items()
+            )
+            p = "p < 0.001" if harmed.p_value < 0.001 else f"p = {harmed.p_value:.2g}"
+            counts = f"{'; '.join(parts)}; {harmed.pairs:,} pairs, {p}"
+        proven = harmed.p_value < LEVEL
+        return cls(effect=_effect(ill, harmed.undone > harmed.caused, proven), counts=counts)
 
     @classmethod
     def of_shares(cls, before: Share, after: Share) -> _Against | None:
@@ -304,50 +313,72 @@ def _effect(ill: int, better: bool, proven: bool) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Safeguard:
-    """A detector or another stack, with its effect against each kind of fault and its costs.
+    """A protection or another stack, with its effect against each kind of fault and its costs.
 
     Attributes:
+        place: name of the regime whose flights it protects; empty if `name` contains it.
         against: effect, keyed by kind of fault; None if that kind was not flown.
         costs: mean share of the flight time that detection and recovery take, by name of the level;
             empty if not measured.
     """
 
     name: str
+    place: str
     against: Mapping[str, _Against | None]
     costs: Mapping[str, float]
 
 
-def protections(flights: Mapping[str, Flights]) -> list[Safeguard]:
-    """Judge each detector at the first place, and our own stack as a substitute for the first.
+def protections(
+    flights: Mapping[str, Flights], beside: Mapping[str, Flights] | None = None
+) -> list[Safeguard]:
+    """Judge detectors at the first place, all arms, and our own stack instead of the first.
 
-    Detectors and the stack are omitted if nothing was flown to judge them.
+    All of these are omitted if nothing was flown to judge them. Arms are judged under the usual
+    rule.
 
     Args:
         flights: flights by place, from `Evidence.by_place`.
+        beside: flights of arms beside those without one, by place; see `Flights.beside_base`.
     """
     name, first = next(iter(flights.items()))
     usual = [place for place in flights if not Regime.of(place).rule]
     own = [place for place in usual if Regime.of(place).stack == Regime.of(name).stack]
     others = [place for place in usual if place not in own and Regime.of(place).stack == STACKS[-1]]
-    safeguards = [
-        Safeguard(
-            name=f"{title} detector",
-            against={
-                kind: _Against.of_pairs(
-                    first.of_fate(fate).balance(detector, level=level, platform=_COMPUTER)
-                )
-                for kind, (level, fate) in _KINDS.items()
-            },
-            costs=_costs(first, detector),
-        )
+    detectors = {
+        detector.upper(): _safeguard(f"{title} detector", name, first, detector)
         for detector, title in DETECTOR_TITLES.items()
+    }
+    arms = [
+        _safeguard(arm, place, mine, arm)
+        for place, mine in (beside or {}).items()
+        if not Regime.of(place).rule
+        for arm in sorted({*mine["detector"]} - {None})
     ]
+    # A detector alone is an arm, too. It is left out if it has the same flights as above.
+    same = {name: guard.against for name, guard in detectors.items()}
+    safeguards = [*detectors.values()]
+    safeguards += [arm for arm in arms if arm.against != same.get(arm.name)]
     for one, other in product(own, others):
         both = flights[one], flights[other]
         shares = [_harmed(*both), _harmed(*reversed(both))]
         against = {kind: _Against.of_shares(*(mine[kind] for mine in shares)) for kind in _KINDS}
-        safeguards.append(Safeguard(name=f"{other} instead of {one}", against=against, costs={}))
+        name = f"{other} instead of {one}"
+        safeguards.append(Safeguard(name=name, place="", against=against, costs={}))
     return [protection for protection in safeguards if any(protection.against.values())]
+
+
+def _safeguard(name: str, place: str, flights: Flights, detector: str) -> Safeguard:
+    """Judge a detector, or an arm that stands in its column, on the same faults without it."""
+    against = {}
+    for kind, (own, fate) in _KINDS.items():
+        # The golden flight of the unprotected flight succeeds, too.
+        where = {"platform": _COMPUTER, "bare_harmed": (True, False), **own}
+        harmed, lost = (
+            flights.of_fate(fate).balance(detector, column=column, **where)
+            for column in ("harmed", "lost")
+        )
+        against[kind] = _Against.of_pairs(harmed, lost)
+    return Safeguard(name=name, place=place, against=against, costs=_costs(flights, detector))
 
 
 def _costs(flights: Flights, detector: str) -> dict[str, float]:
@@ -363,11 +394,10 @@ def _harmed(flights: Flights, others: Flights) -> dict[str, Share]:
     Only scenes that `others` contains too are counted. A scene is a world with a mission seed.
     """
     scenes = {*_scenes(others)}
-    mine = flights.struck(platform=_COMPUTER)
-    mine = mine.where(scene in scenes for scene in _scenes(mine))
+    mine = flights.where(scene in scenes for scene in _scenes(flights))
     return {
-        kind: mine.of_fate(fate).chosen(level=level).share("harmed")
-        for kind, (level, fate) in _KINDS.items()
+        kind: mine.of_fate(fate).struck(platform=_COMPUTER, **where).share("harmed")
+        for kind, (where, fate) in _KINDS.items()
     }
 
 

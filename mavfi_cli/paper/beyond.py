@@ -12,6 +12,8 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from itertools import compress
 from operator import itemgetter
 from pathlib import Path
 from statistics import stdev
@@ -20,10 +22,13 @@ from typing import Any, NamedTuple
 from mavfi_cli.analysis.pairs import STRUCK, USUAL, Fate, Flights, back
 from mavfi_cli.campaigns.missions import Injected, canonical
 from mavfi_cli.core.config import read_toml
+from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import BY_NAME, DType
 from mavfi_cli.paper.items import Regime, printed
 from mavfi_cli.report.paper import Printed
-from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.detector import PAPER
+from mavfi_cli.spec.mission import NOT_OF_GOLDEN, MissionConfig
+from mavfi_cli.spec.stack import Stack, load_stack
 from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
 from mavfi_cli.stats.paired import McNemar, holm
 from mavfi_cli.stats.shares import Interval, Share, cross_layer, wilson
@@ -215,9 +220,8 @@ def _kind(flight: Row) -> str:
 
 # An arm is a stack with or without a detector. Only faults that were read in the unprotected arm
 # count, so all arms are compared on the same faults in the same scenes.
-_BASE = "mavbench"
 _WORDS, _ = read_toml(Path(__file__).parent / "arms.toml")
-PLAIN = _WORDS["stacks"][""]
+PLAIN = "unprotected"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -238,23 +242,74 @@ class Arm:
     p_value: float | None
     corrected_p: float | None
 
+    @staticmethod
+    def by_base(flights: Flights, *, every: bool = False) -> dict[str, Flights]:
+        """Return the flights of each base stack and its variants, keyed by the base.
 
-def arms(flights: Flights) -> list[Arm]:
-    """Return the arms of a campaign with several stacks, the unprotected arm first.
+        Each variant stands beside its base as in `Flights.beside_base`. The base is that of the
+        variants, such as BASE in `BASE:restores_counters=true`. A base without variants is omitted.
+        The golden flight of a variant is that of the variant, or else that of the flown variant
+        with the most of its settings, or that of the base.
 
-    Return an empty list if there is only one stack or arm, or if no fault that was read in the
-    unprotected arm was flown in all arms.
+        Args:
+            every: keep all variants, and not only those that only add protections.
+        """
+        variants = [_variant(stack) for stack in flights["stack"]]
+        companions = (name is not None for name in flights["companion"])
+        kept = [not companion and (every or variant.protects)
+                for companion, variant in zip(companions, variants, strict=True)]  # fmt: skip
+        mine, variants = flights.where(kept), [*compress(variants, kept)]
+        configs = [json.loads(changes) for changes in mine["changes"]]
+        scenes = [
+            canonical({**{name: value for name, value in config.items()
+                          if name not in NOT_OF_GOLDEN}, "stack": variant.base})
+            for config, variant in zip(configs, variants, strict=True)
+        ]  # fmt: skip
+        names = [
+            " and ".join(filter(None, (variant.name, _detector(config)))) or None
+            for config, variant in zip(configs, variants, strict=True)
+        ]
+        flown: dict[str, dict[_Settings, int]] = {}
+        for place, row in enumerate(mine.rows("level", "detector")):
+            if row["level"] is None and row["detector"] is None:
+                flown.setdefault(scenes[place], {}).setdefault(variants[place].settings, place)
+        golden = [
+            max(
+                ((len(settings), place) for settings, place in flown.get(scene, {}).items()
+                 if settings <= variant.settings),
+                default=(0, -1),
+            )[1]
+            for scene, variant in zip(scenes, variants, strict=True)
+        ]  # fmt: skip
+        beside = mine.beside_base(scenes, names, golden)
+        grouped = beside.grouped(variant.base for variant in variants)
+        return {base: those for base, those in grouped.items() if {*those["stack"]} != {base}}
+
+
+def arms(flights: Flights, *, every: bool = False) -> dict[str, list[Arm]]:
+    """Return the arms of a campaign with variants of a stack, keyed by this base stack.
+
+    The unprotected arm is the first. A base is omitted if no fault that was read in its unprotected
+    arm was flown in all its arms.
+
+    Args:
+        every: compare all variants, and not only protections.
     """
-    if len(set(flights["stack"])) < 2:
-        return []
+    by_base = {base: _arms(mine) for base, mine in Arm.by_base(flights, every=every).items()}
+    return {base: found for base, found in by_base.items() if found}
+
+
+def _arms(flights: Flights) -> list[Arm]:
+    """Return the arms of one base stack, from `Arm.by_base`."""
     golden: dict[str, list[Row]] = {}
-    trials: dict[str, dict[str, Row]] = {}
+    trials: dict[str, dict[tuple[Any, ...], Row]] = {}
     for flight in flights.rows(*_READ):
-        name = _arm_of(flight)
+        name = flight["detector"] or PLAIN
         if flight["level"] is None:
             golden.setdefault(name, []).append(flight)
-        elif name:
-            trials.setdefault(name, {})[_trial_of(flight)] = flight
+        else:
+            trial = (flight["pair"], flight["fault"], flight["restart_s"])
+            trials.setdefault(name, {})[trial] = flight
     plain = trials.get(PLAIN, {}).items()
     read = (trial for trial, flight in plain if flight["activation"] == "read")
     shared = sorted(set(read).intersection(*trials.values()))
@@ -278,29 +333,62 @@ def arms(flights: Flights) -> list[Arm]:
     ]
 
 
-_READ = ("stack", "detector", "level", "fault", "fault_target", "activation", "lost", "changes")
+_READ = (
+    "pair", "detector", "level", "fault", "restart_s", "fault_target", "activation", "lost",
+)  # fmt: skip
 
 
-def _arm_of(flight: Row) -> str:
-    """Return the name of a flight's arm, or "" if its stack is not a variant of mavbench."""
-    base, _, changes = flight["stack"].partition(":")
-    if base not in (_BASE, f"{_BASE}-protected"):
+_Settings = frozenset[tuple[str, str]]  # keys of a stack and their values as canonical JSON
+
+
+class _Variant(NamedTuple):
+    """A stack as an arm: its base, its differences, and whether all of them protect."""
+
+    base: str
+    settings: _Settings = frozenset()
+    name: str = ""
+    protects: bool = True
+
+
+@cache
+def _variant(stack: str) -> _Variant:
+    try:
+        base, changes = Stack.split(stack)
+    except ConfigError:  # not a text that this version can read
+        return _Variant(stack)
+    settings = _settings(changes)
+    whole = _PARTS.get(settings)
+    parts = [words for part, words in _PARTS.items() if len(part) == 1 and part <= settings]
+    known = len(parts) == len(settings)
+    words = [whole] if whole else parts if known else [stack.partition(":")[2]]
+    protects = known and {*parts} <= _PROTECTIONS
+    if (protected := _WORDS["protected_stacks"].get(base)) is not None:
+        words.insert(0, protected)
+        settings |= {(base, "")}
+        base = load_stack(base).base
+    return _Variant(base, settings, " with ".join(words), protects)
+
+
+def _settings(changes: Mapping[str, Any]) -> _Settings:
+    return frozenset((key, canonical(value)) for key, value in changes.items())
+
+
+_PARTS = {
+    _settings(Stack.split(f":{text}")[1]): words
+    for table in ("protections", "variants")
+    for text, words in _WORDS[table].items()
+}
+_PROTECTIONS = frozenset(_WORDS["protections"].values())
+
+
+def _detector(config: Mapping[str, Any]) -> str:
+    """Return the name of a mission's detector, with its watch if it is not that of the paper."""
+    detector = config.get("detector")
+    if detector is None:
         return ""
-    change = _WORDS["stacks"].get(changes, changes)
-    name = change if base == _BASE else "all four checks" + (f", {change}" if changes else "")
-    detector = (flight["detector"] or "").upper()
-    if not detector:
-        return name
-    return detector if name == PLAIN else f"{name} and {detector}"
-
-
-def _trial_of(flight: Row) -> str:
-    """Return a flight's configuration as text, without the fields that differ between arms."""
-    config = json.loads(flight["changes"])
-    return canonical({name: value for name, value in config.items() if name not in _APART})
-
-
-_APART = ("detector", "isolate", "stack")
+    watch = detector.get("watch", PAPER)
+    name = str(detector.get("name", "")).upper()
+    return name + ("" if watch == PAPER else f" ({watch} watch)")
 
 
 def _lost(flights: Sequence[Row]) -> Share:

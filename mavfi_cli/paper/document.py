@@ -202,6 +202,15 @@ class Document:
         return self.places[0]
 
     @property
+    def kinds(self) -> list[str]:
+        """The kinds of faults against which protections were flown."""
+        return [
+            kind
+            for kind in (self.protections[0].against if self.protections else ())
+            if any(guard.against[kind] for guard in self.protections)
+        ]
+
+    @property
     def answer(self) -> str:
         """The sentence on how far `place` reproduces the paper."""
         return self.answers[self.place]
@@ -253,10 +262,18 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         source.name if names[source.name] == 1 else str(source.path): source.flights
         for source in evidence.campaigns
     }
-    by_arm = {name: found for name, mine in named.items() if (found := arms(mine.comparable))}
+    by_arm = {
+        Regime(name if base == STACKS[0] else f"{name} on {base}", rule=rule).name: found
+        for name, mine in named.items()
+        for rule, those in mine.comparable.by_rules.items()
+        for base, found in arms(those).items()
+    }
     everything = evidence.flights()
+    beside = dict[str, Flights]()
+    for base, mine in Arm.by_base(everything.comparable).items():
+        beside |= Regime.split(base, mine)
     added = [*Delays.of(places[0], flights[places[0]])]
-    guards = protections(flights)
+    guards = protections(flights, beside)
     step("drawing the figures")
     return Document(
         version=__version__,
@@ -301,12 +318,18 @@ def _advice(guards: Sequence[Safeguard]) -> str:
     """Return advice for a designer, with one sentence for each kind of fault that did harm."""
     sentences = []
     for kind in guards[0].against if guards else ():
-        effects = {guard.name: cell.effect for guard in guards if (cell := guard.against[kind])}
-        helping = [name for name, effect in effects.items() if effect == "helps"]
-        if helping:
-            helps = "helps" if len(helping) == 1 else "help"
-            sentences.append(f"Against {kind}, {' and '.join(helping)} {helps}.")
-        elif {*effects.values()} - {"nothing to undo"}:
+        cells = [(guard, cell.effect) for guard in guards if (cell := guard.against[kind])]
+        helping: dict[str, list[str]] = {}
+        for guard, effect in cells:
+            if effect == "helps":
+                helping.setdefault(guard.place, []).append(guard.name)
+        for place, names in helping.items():
+            helps = "helps" if len(names) == 1 else "help"
+            comma = "," if names[2:] else ""
+            listed = f"{', '.join(names[:-1])}{comma} and {names[-1]}" if names[1:] else names[0]
+            where = f" ({place})" if place else ""
+            sentences.append(f"Against {kind}, {listed} {helps}{where}.")
+        if not helping and {effect for _, effect in cells} - {"nothing to undo"}:
             sentences.append(f"Against {kind}, nothing flown here is proven to help.")
     return " ".join(sentences)
 

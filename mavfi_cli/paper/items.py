@@ -54,6 +54,20 @@ class Regime(NamedTuple):
         rule = _AND.join(part for part in parts if part not in WORLDS.values())
         return cls(stack, worlds, rule)
 
+    @staticmethod
+    def split(stack: str, flights: Flights) -> dict[str, Flights]:
+        """Split a stack's flights by rule, and by kind of worlds if both kinds were flown.
+
+        The keys are names of regimes. The intervals of a table with both kinds of worlds would hold
+        for neither. A rule other than the usual one is omitted if no fault was flown under it.
+        """
+        kinds = flights.by_worlds
+        return {
+            Regime(stack, kind, rule).name: mine
+            for kind, those in (kinds if len(kinds) > 1 else {"": flights}).items()
+            for rule, mine in those.by_rules.items()
+        }
+
     @property
     def name(self) -> str:
         """The regime in words."""

@@ -21,6 +21,7 @@ from mavfi_cli.campaigns.specification_file import PRESETS, load_spec
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.files import file_digest, reading
 from mavfi_cli.core.installed import installed_versions, version_differences
+from mavfi_cli.paper.beyond import Arm
 from mavfi_cli.paper.items import FlightsPlan, Regime
 from mavfi_cli.paper.verdicts import Settling
 
@@ -147,20 +148,10 @@ class Evidence:
         }
 
     def by_place(self, stacks: Sequence[str]) -> dict[str, Flights]:
-        """Return the flights of each stack and rule, apart for each kind of worlds if it has both.
-
-        The keys are names of regimes. The intervals of a table with both kinds of worlds would hold
-        for neither. A rule other than the usual one is omitted if no fault was flown under it.
-        """
+        """Return the flights of each stack, split by `Regime.split`."""
         places = dict[str, Flights]()
         for stack in stacks:
-            flights = self.flights(stack)
-            kinds = flights.by_worlds
-            if len(kinds) < 2:
-                kinds = {"": flights}
-            for kind, those in kinds.items():
-                for rule, mine in those.by_rules.items():
-                    places[Regime(stack, kind, rule).name] = mine
+            places |= Regime.split(stack, self.flights(stack))
         return places
 
     def flights(self, stack: str | None = None) -> Flights:
@@ -271,25 +262,34 @@ def _unpaired(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
     companions are neither paired nor compared with the paper.
     """
     pooled = Flights.pooled([source.flights for source in campaigns])
-    paired = {
-        changes
-        for changes, own in zip(pooled["changes"], pooled["own_lost"], strict=True)
-        if own is not None
-    }
+    paired = _with_golden(pooled)
+    of_base = set[str]().union(*map(_with_golden, Arm.by_base(pooled).values())) - paired
     for source in campaigns:
         repeated = source.flights.chosen(companion=None)
         faulty = repeated.chosen(level=("source", "instruction"))
-        alone = sum(changes not in paired for changes in faulty["changes"])
+        of_others = sum(changes in of_base for changes in faulty["changes"])
+        alone = sum(changes not in paired for changes in faulty["changes"]) - of_others
         if alone:
             yield (
                 f"{source.path.name}: {alone:,} of {len(faulty):,} flights with a fault have no "
                 "golden flight of the same mission here, so they show no effect of the fault."
+            )
+        if of_others:
+            yield (
+                f"{source.path.name}: {of_others:,} of {len(faulty):,} flights with a fault have "
+                "no golden flight with all their protections; one with fewer or none stands in."
             )
         if len(repeated) and not any(repeated["as_paper"]):
             yield (
                 f"{source.path.name}: no flight is like the paper's (its vehicle, speed and "
                 "sensors, and one flip of drawn bits), so none judges a claim."
             )
+
+
+def _with_golden(flights: Flights) -> set[str]:
+    """Return the configurations of the flights that have a golden flight, as text."""
+    both = zip(flights["changes"], flights["own_lost"], strict=True)
+    return {changes for changes, own in both if own is not None}
 
 
 def _repeated(kernels: Sequence[KernelSummary]) -> Iterator[str]:

@@ -167,6 +167,22 @@ class Stack:
                     raise ValueError(f"processes: must not name {node} twice")
                 seen.add(node)
 
+    @staticmethod
+    def split(text: str) -> tuple[str, dict[str, Any]]:
+        """Return the stack's name or file that a text for `load_stack` gives, and its changes.
+
+        Raises:
+            ConfigError: the changes are not KEY=VALUE,KEY=VALUE. Keys and values are not checked.
+        """
+        name, _, changes = text.partition(":")
+        try:
+            return name, tomllib.loads("\n".join(_quoted(pair) for pair in _PAIR.split(changes)))
+        except tomllib.TOMLDecodeError:
+            raise ConfigError(
+                f"must have KEY=VALUE,KEY=VALUE after the stack's name, got {changes!r}",
+                key="stack",
+            ) from None
+
     def settings_of(self, params: type) -> dict[str, Any]:
         """Return the stack's value for each key that is also a field of the dataclass `params`."""
         return {key.name: getattr(self, key.name) for key in fields(params) if key.name in KEYS}
@@ -216,18 +232,12 @@ def load_stack(text: str) -> Stack:
         ConfigError: No stack has this key, the file or a value cannot be used, a key is missing, or
             the stack is inconsistent.
     """
-    name, colon, changes = text.partition(":")
+    name, changed = Stack.split(text)
     path = STACKS.path(name)
     values, source = _values(path)
     stack = structure(values, Stack, path=path, text=source)
-    if not colon:
+    if ":" not in text:
         return stack
-    try:
-        changed = tomllib.loads("\n".join(_quoted(pair) for pair in _PAIR.split(changes)))
-    except tomllib.TOMLDecodeError:
-        raise ConfigError(
-            f"must have KEY=VALUE,KEY=VALUE after the stack's name, got {changes!r}", key="stack"
-        ) from None
     sources = {**values.get("sources", {}), **dict.fromkeys(changed, "this variant's name")}
     about = {"name": text, "base": name, "description": "", "sources": sources}
     return structure({**values, **changed, **about}, Stack)  # its errors are not the file's

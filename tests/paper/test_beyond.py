@@ -6,6 +6,7 @@ import pytest
 from made_flights import flights, row
 
 from mavfi_cli.paper.beyond import (
+    Arm,
     arms,
     companion_arms,
     hourly_failures,
@@ -108,7 +109,7 @@ def test_arms_are_counted_on_the_faults_that_the_unprotected_flight_read():
         read = "overwritten" if seed == 6 else "read"
         rows += [row(seed=seed), row("waypoint_position", seed=seed, activation=read, **lost)]
         rows += [row("waypoint_position", seed=seed, **guard)]
-    plain, guarded = arms(flights(rows))
+    plain, guarded = arms(flights(rows))["mavbench"]
     assert (plain.name, guarded.name) == ("unprotected", "tracking guard")
     assert (plain.lost.count, plain.lost.total) == (5, 6)
     assert (guarded.lost.count, guarded.lost.total) == (0, 6)
@@ -122,18 +123,72 @@ def test_variants_of_the_stack_with_all_checks_are_arms_of_their_own():
     for stack in ("mavbench-protected", "mavbench-protected:guards_tracking=true"):
         lost = LOST if ":" in stack else {}
         rows.append(row("planning", seed=1, config={"stack": stack}, **lost))
-    found = {arm.name: arm.lost.count for arm in arms(flights(rows))}
-    assert found == {"unprotected": 1, "all four checks": 0, "all four checks, tracking guard": 1}
+    found = {arm.name: arm.lost.count for arm in arms(flights(rows))["mavbench"]}
+    assert found == {
+        "unprotected": 1, "all four checks": 0, "all four checks with tracking guard": 1,
+    }  # fmt: skip
 
 
 def test_the_unprotected_arm_alone_compares_nothing():
     rows = [row("planning", seed=1, config={"stack": stack}) for stack in ("mavbench", "hardened")]
-    assert arms(flights(rows)) == []
+    assert arms(flights(rows)) == {}
 
 
 def test_one_stack_has_no_arms():
     rows = [row(seed=1), row("planning", seed=1), row("planning", seed=1, detector="gad")]
-    assert arms(flights(rows)) == []
+    assert arms(flights(rows)) == {}
+
+
+def on(stack, target=None, **how):
+    return row(target, config={"stack": stack}, **how)
+
+
+def test_any_stack_has_arms_and_only_protections_are_mechanisms():
+    """Equal settings are equal however they are written, and a smoothing protects nothing."""
+    base, other = "mavbench-replica", "mavbench-replica:smoother=release"
+    variants = (
+        "standby = ['planner']",
+        "processes=[],restores_counters=true",
+        "goal_tolerance_m=2",
+    )
+    rows = [row("planning", seed=1), on(base, "planning", seed=1), on(other, "planning", seed=1)]
+    rows += [on(f"{base}:{each}", "planning", seed=1) for each in variants]
+    rows += [on("not:a=stack=", "planning", seed=1)]
+    rows += [on(f"{base}:standby=['planner']", "planning", detector="aad", seed=1)]
+    names = ["unprotected", "hot standby", "supervisor with a process for each node",
+             "hot standby and AAD"]  # fmt: skip
+    found = arms(flights(rows))
+    assert {stack: [arm.name for arm in mine] for stack, mine in found.items()} == {base: names}
+    every = {arm.name for arm in arms(flights(rows), every=True)[base]}
+    assert every - {*names} == {"smoothing of the release", "goal_tolerance_m=2"}
+
+
+def test_an_arm_is_compared_with_the_golden_flight_that_is_most_like_its_own():
+    shared, supervised = "mavbench:processes=[]", "mavbench:restores_counters=true,processes=[]"
+    rows = [on("mavbench", seed=1, time_s=20.0), on(shared, seed=1, time_s=30.0)]
+    rows += [on("mavbench", seed=2, time_s=20.0), on(shared, seed=2, **LOST)]
+    rows += [on("mavbench", seed=3, time_s=20.0)]
+    for seed in (1, 2, 3):
+        rows += [on("mavbench", "planning", seed=seed, **LOST)]
+        rows += [on(supervised, "planning", seed=seed, time_s=30.0)]
+    mine = Arm.by_base(flights(rows))["mavbench"]
+    (name,) = {*mine["detector"]} - {None, "a process for each node"}
+    seen = mine.chosen(detector=name)
+    assert seen["bare_lost"] == [True, True, True]
+    assert seen["own_flight_time_s"] == [30.0, 20.0, 20.0]
+    assert seen["own_lost"] == [False, True, False]
+    assert seen["harmed"] == [False, None, True]
+    assert mine.balance(name).pairs == 2
+
+
+def test_arms_are_compared_under_the_same_restart_rule_and_injector():
+    supervised = {"stack": "mavbench:restores_counters=true"}
+    rows = [row(seed=1), under(1.0, 1, **LOST), under(1.0, 1, supervised)]
+    rows += [under(3600.0, 1), under(1.0, 1, fault={"compat": "rosfi-2021"})]
+    balance = Arm.by_base(flights(rows))["mavbench"].balance("supervisor", column="lost")
+    assert (balance.pairs, balance.undone) == (1, 1)
+    rows = [row(seed=1), under(3600.0, 1, **LOST), under(1.0, 1, supervised)]
+    assert Arm.by_base(flights(rows))["mavbench"].balance("supervisor").pairs == 0
 
 
 # When a dead node comes back ----------------------------------------------------------------------
