@@ -394,20 +394,20 @@ class Flights:
         """The flights without a detector, or with one that watches all stages."""
         return self.chosen(protect=(None, EVERY_STAGE))
 
-    def shared(self, *names: str, arm: str = "detector") -> Flights:
+    def shared(self, *names: str, arm: Sequence[str] = ("detector",)) -> Flights:
         """Return the flights without a fault, and those whose fault was flown in every arm.
 
-        The arms are the values of a column, such as the detectors.
+        The arms are the values of columns, such as the detectors.
 
         Args:
             names: columns that split the flights into groups. Each group has its own arms, and a
                 fault is kept if it was flown in every arm of one of the groups.
-            arm: column whose values are the arms; a null, such as no detector, is an arm too.
+            arm: columns whose values are the arms; a null, such as no detector, is an arm too.
         """
-        arms = self.where(level is not None for level in self["level"]).by(*names, arm)
+        arms = self.where(level is not None for level in self["level"]).by(*names, *arm)
         groups: dict[tuple[Any, ...], list[set[tuple[str, str]]]] = {}
-        for (*group, _), flights in arms.items():
-            groups.setdefault(tuple(group), []).append(set(flights.faults))
+        for key, flights in arms.items():
+            groups.setdefault(key[: len(names)], []).append(set(flights.faults))
         shared = {fault for group in groups.values() for fault in set.intersection(*group)}
         faults = zip(self["level"], self.faults, strict=True)
         return self.where(level is None or fault in shared for level, fault in faults)

@@ -25,7 +25,7 @@ from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import BY_NAME, DType
 from mavfi_cli.paper.items import Regime, printed
-from mavfi_cli.report.paper import Printed
+from mavfi_cli.report.paper import DETECTOR_TITLES, Printed
 from mavfi_cli.spec.detector import PAPER
 from mavfi_cli.spec.mission import NOT_OF_GOLDEN, MissionConfig
 from mavfi_cli.spec.stack import Stack, load_stack
@@ -415,9 +415,12 @@ class RestartComparison:
         place: the stack, the injector that is copied, if any, and the kind of its worlds if the
             missions have both kinds.
         paper: success rates in Table IV, in per cent, for golden flights and for flights with a
-            fault; None if the table lacks the world.
+            fault, alone and with each detector; None if the table lacks the world.
         golden: share of golden flights that succeed.
         success: share of missions with instruction-level faults that succeed, by restart rule.
+        watched: share of missions that succeed without a detector (the key None) and with each,
+            by restart rule; only faults of the paper's kind that were flown in all of these. Empty
+            unless detectors were flown under several rules.
         lost: share of missions that are lost, by restart rule and fate of the fault.
         p_value: p-value of McNemar's exact test between the earliest and the latest restart.
     """
@@ -427,6 +430,7 @@ class RestartComparison:
     paper: Sequence[Printed]
     golden: Share
     success: Mapping[str, Share]
+    watched: Mapping[str, Mapping[str | None, Share]]
     lost: Mapping[str, Mapping[Fate, Share]]
     p_value: float
 
@@ -449,14 +453,37 @@ def restarts(flights: Flights) -> list[RestartComparison]:
 
 def _of_kind(kind: str, flights: Flights) -> Iterator[RestartComparison]:
     hit = flights.struck(level="instruction", own_lost=False)
-    hit = hit.shared("stack", "world", arm="restart_s")
-    places = zip(hit["stack"], hit["injector"], hit["world"], strict=True)
-    by_place = {place: mine.by("restart_s") for place, mine in hit.grouped(places).items()}
+    hit = hit.shared("stack", "world", arm=("restart_s",))
+    watched = flights.chosen(level="instruction", as_paper=True, own_lost=False, bare_struck=True)
+    with_detector = watched.chosen(detector=(None, *DETECTOR_TITLES)).by(*_PLACE)
+    by_place = {place: mine.by("restart_s") for place, mine in hit.by(*_PLACE).items()}
     for stack, injector in sorted({(stack, injector) for stack, injector, _ in by_place}):
         for world in hit.worlds:
             if len(rules := by_place.get((stack, injector, world), {})) > 1:
                 row = _restarts(stack, world, rules, flights.golden)
-                yield replace(row, place=Regime(stack, kind, injector).name)
+                those = with_detector.get((stack, injector, world))
+                yield replace(
+                    row,
+                    place=Regime(stack, kind, injector).name,
+                    watched={} if those is None else _watched(those),
+                )
+
+
+_PLACE = ("stack", "injector", "world")
+
+
+def _watched(flights: Flights) -> dict[str, dict[str | None, Share]]:
+    """Return `RestartComparison.watched` of the flights in a place, without and with detectors."""
+    rules = {row["restart_s"] for row in flights.rows("restart_s", "detector") if row["detector"]}
+    if len(rules) < 2:
+        return {}
+    shared = flights.chosen(restart_s=(*rules,)).shared(arm=("restart_s", "detector"))
+    return {
+        back(delay_s): {
+            name: mine.chosen(detector=name).share(value=False) for name in (None, *DETECTOR_TITLES)
+        }
+        for (delay_s,), mine in sorted(shared.by("restart_s").items(), key=itemgetter(0))
+    }
 
 
 def _restarts(
@@ -468,9 +495,13 @@ def _restarts(
     return RestartComparison(
         place=stack,
         world=world,
-        paper=[printed("table4", "success_percent", kind, world) for kind in ("golden", "none")],
+        paper=[
+            printed("table4", "success_percent", kind, world)
+            for kind in ("golden", "none", *DETECTOR_TITLES)
+        ],
         golden=golden.chosen(stack=stack, world=world).share(value=False),
         success={rule: mine.share(value=False) for rule, mine in flown.items()},
+        watched={},
         lost={
             rule: {fate: mine.of_fate(fate).share() for fate in (Fate.SILENT, Fate.DEAD)}
             for rule, mine in flown.items()

@@ -213,8 +213,28 @@ def test_restart_rules_are_compared_on_the_faults_that_all_of_them_flew():
         "back after 1 s": ["0 of 2", "0 of 1"],
         "never back": ["1 of 2", "1 of 1"],
     }
-    assert (found.golden.counts, found.paper) == ("4 of 4", [95.0, 88.3])
+    assert (found.golden.counts, found.paper) == ("4 of 4", [95.0, 88.3, 94.3, 95.0])
+    assert found.watched == {}
     assert found.p_value == 0.5
+
+
+def test_detectors_are_compared_under_each_rule_on_faults_that_all_of_them_flew():
+    rows = [row(seed=seed) for seed in (1, 2, 3)]
+    for restart_s in (1.0, 3600.0):
+        for seed in (1, 2, 3):
+            end = LOST if seed == 1 or restart_s > 1.0 else {}
+            rows += [under(restart_s, seed, **end)]
+            rows += [under(restart_s, seed, detector="gad", **end)] if seed < 3 else []
+            rows += [under(restart_s, seed, detector="aad")]
+    rows += [under(5.0, seed) for seed in (1, 2)]  # without a detector
+    (found,) = restarts(flights(rows))
+    assert {
+        rule: [each.counts for each in mine.values()] for rule, mine in found.watched.items()
+    } == {
+        "back after 1 s": ["1 of 2", "1 of 2", "2 of 2"],
+        "never back": ["0 of 2", "0 of 2", "2 of 2"],
+    }
+    assert found.rules == ("back after 1 s", "back after 5 s", "never back")
 
 
 def test_restart_rules_are_compared_by_injector_and_without_lost_golden_flights():
