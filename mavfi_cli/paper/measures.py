@@ -18,6 +18,7 @@ import numpy as np
 from mavfi_cli.analysis.flights import COSTS, known, numbers
 from mavfi_cli.analysis.kernels import IsolatedKernel
 from mavfi_cli.analysis.pairs import EVERY_STAGE, LONGER, Flights
+from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.run_folder import TRACE
@@ -54,9 +55,19 @@ def _difference(shares: Sequence[Share], counts: str) -> Finding:
 
 def _harm_gap(groups: Mapping[str, Flights], what: str) -> Finding:
     """Return the share of harmed missions in the first of two groups minus that in the second."""
-    shares = {name: _clustered(flights, "harmed") for name, flights in groups.items()}
-    counts = "; ".join(f"{name} {share.counts}" for name, share in shares.items())
-    return _difference([*shares.values()], f"{what}: {counts}")
+    shares = [_clustered(flights, "harmed") for flights in groups.values()]
+    counts = "; ".join(
+        f"{name} {share.counts}{_unread(flights)}"
+        for (name, flights), share in zip(groups.items(), shares, strict=True)
+    )
+    return _difference(shares, f"{what}: {counts}")
+
+
+def _unread(flights: Flights) -> str:
+    """State how many faults expired before anything read them; empty if there are none."""
+    known = flights.chosen(harmed=(True, False))
+    unread = known["injected"].count(Injected.NOT_ACTIVATED.value)
+    return f", {unread:,} of them never read" if unread else ""
 
 
 def _mean(flights: Flights, values: Sequence[float], counts: str) -> Finding:
@@ -139,7 +150,8 @@ def _harm_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
 
 def _harmful(flights: Flights, **where: Any) -> Finding:
     """Return the share of faults that harm their mission."""
-    return _of_share(_clustered(flights.struck(**where), "harmed"), "harmful")
+    hit = flights.struck(**where)
+    return _of_share(_clustered(hit, "harmed"), f"harmful{_unread(hit)}")
 
 
 def _loss_difference(

@@ -44,6 +44,17 @@ def test_success_lost_is_paired_and_counts_faults_that_nothing_read():
     assert found.counts == "1 of 9 lost; golden 0 of 9"
 
 
+def test_harm_counts_faults_that_nothing_read_and_says_how_many():
+    rows = pairs("collision", *[20.0] * 3, "timeout")
+    rows[3] = {**rows[3], "injected": "not_activated"}
+    rows[8] = {**rows[8], "outcome": "collision"}  # a lost golden flight
+    rows[9] = {**rows[9], "injected": "not_activated"}
+    assert MEASURES["harmful"](flights(rows)).counts == "1 of 4 harmful, 1 of them never read"
+    groups = {"planning": {"fault_target": "planning"}, "seed 1": {"seed": 1}}
+    found = MEASURES["harm_difference"](flights(rows), groups)
+    assert found.counts == "harmful: planning 1 of 4, 1 of them never read; seed 1 1 of 1"
+
+
 def watched(rows, detector, *times):
     """The same faults with a detector."""
     found = []
