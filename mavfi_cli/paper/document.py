@@ -323,13 +323,15 @@ def _advice(guards: Sequence[Safeguard]) -> str:
         for guard, effect in cells:
             if effect == "helps":
                 helping.setdefault(guard.place, []).append(guard.name)
+        parts = []
         for place, names in helping.items():
             helps = "helps" if len(names) == 1 else "help"
             comma = "," if names[2:] else ""
             listed = f"{', '.join(names[:-1])}{comma} and {names[-1]}" if names[1:] else names[0]
-            where = f" ({place})" if place else ""
-            sentences.append(f"Against {kind}, {listed} {helps}{where}.")
-        if not helping and {effect for _, effect in cells} - {"nothing to undo"}:
+            parts.append(f"{listed} {helps}" + (f" ({place})" if place else ""))
+        if parts:
+            sentences.append(f"Against {kind}, {'; '.join(parts)}.")
+        elif {effect for _, effect in cells} - {"nothing to undo"}:
             sentences.append(f"Against {kind}, nothing flown here is proven to help.")
     return " ".join(sentences)
 
