@@ -1,5 +1,6 @@
 """Find processes, and await their end though they may be no children of ours."""
 
+import contextlib
 import os
 import select
 from pathlib import Path
@@ -11,6 +12,16 @@ def children(pid):
     """Process ids of the direct children."""
     listed = Path(f"/proc/{pid}/task/{pid}/children").read_text()
     return [int(child) for child in listed.split()]
+
+
+def family(pid):
+    """A process and all of its descendants."""
+    found = [pid]
+    for number in found:
+        with contextlib.suppress(OSError):
+            for own in Path(f"/proc/{number}/task").glob("*/children"):
+                found += map(int, own.read_text().split())
+    return found
 
 
 def await_end(descriptor):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import select
 import signal
 import socket
@@ -18,6 +19,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ import numpy as np
 
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError, described
 from mavfi_cli.core.files import ScratchFolder
+from mavfi_cli.core.fork_server import die_with
 from mavfi_cli.core.frames import is_within
 from mavfi_cli.core.processes import PYTHON
 from mavfi_cli.core.seeds import Stream
@@ -204,7 +207,9 @@ def _read_truth(folder: Path) -> FlightTruth | None:
 
 
 class VehicleProcess(Vehicle):
-    """A vehicle in its own process, `python -m sitl`. Closing the link ends the process.
+    """A vehicle in its own process, `python -m sitl`.
+
+    The process ends when the link closes, and is killed when this process is.
 
     Raises:
         VehicleProcessError: The process cannot be started.
@@ -232,6 +237,8 @@ class VehicleProcess(Vehicle):
                     stderr=self._errors,
                     pass_fds=[theirs.fileno()],
                     start_new_session=True,  # Ctrl-C is for the companion, which then closes
+                    # While its firmware boots, it does not see that the link has closed.
+                    preexec_fn=partial(die_with, os.getpid()),
                 )
             except OSError as error:
                 ours.close()

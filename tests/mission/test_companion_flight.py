@@ -1,6 +1,5 @@
 """Flights of a user's own companion: the outcome, the record, and what becomes of bad ones."""
 
-import contextlib
 import math
 import os
 import subprocess
@@ -14,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from live_processes import LONG_S, gone
+from live_processes import LONG_S, family, gone
 from made_flights import companion_gate
 
 from mavfi_cli import library
@@ -87,16 +86,6 @@ def test_a_flight_leaves_a_record_as_any_other(fly):
     assert ViewedFlight(name="flight", run=run, recorder=None).run is run
     with pytest.raises(RecordError, match="is not repeatable"):
         fly_again(run, run.folder.path.parent)
-
-
-def family(pid):
-    """A process and all of its descendants."""
-    found = [pid]
-    for number in found:
-        with contextlib.suppress(OSError):
-            for own in Path(f"/proc/{number}/task").glob("*/children"):
-                found += map(int, own.read_text().split())
-    return found
 
 
 @pytest.mark.slow

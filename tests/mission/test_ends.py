@@ -4,10 +4,11 @@ import json
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
-from live_processes import await_end
+from live_processes import LONG_S, await_end, family, gone
 from missions import RECORD
 
 from mavfi_cli.autonomy import collision
@@ -66,6 +67,23 @@ def test_a_killed_mission_by_the_wall_clock_leaves_no_vehicle(flying):
         mission.process.kill()
         mission.process.wait()
         await_end(vehicle)
+
+
+def test_a_killed_mission_leaves_no_vehicle_and_no_firmware_that_boots(flying, tmp_path):
+    firmware = tmp_path / "arducopter"
+    firmware.write_text("#!/bin/sh\nexec sleep 600\n")
+    firmware.chmod(0o755)
+    mission = flying("--realtime", "--autopilot", "ardupilot", "--firmware", str(firmware))
+    until_s = time.monotonic() + LONG_S
+    processes = []
+    while not (processes and Path(f"/proc/{processes[-1]}/comm").read_text() == "sleep\n"):
+        assert time.monotonic() < until_s
+        processes = family(mission.process.pid)[1:]
+    mission.process.kill()
+    mission.process.wait()
+    killed_s = time.monotonic()
+    assert all(map(gone, processes))
+    assert time.monotonic() - killed_s < 5.0  # before the vehicle gives up on the firmware
 
 
 @pytest.mark.slow
