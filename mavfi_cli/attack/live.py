@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.attack.tracer_thread import Notice
-from mavfi_cli.core.errors import FaultSpecError
+from mavfi_cli.core.errors import FaultSpecError, TracingForbidden
 from mavfi_cli.core.processes import Ended
 from mavfi_cli.fi.tracer import linux, record
 from mavfi_cli.fi.tracer.fault import FaultModel, InstructionFault, Rule, Strategy
@@ -170,8 +170,11 @@ def attack_moment(
         UnknownName: the process has no such object or function.
         BuildMismatch: the record comes from another build.
     """
-    image = Image(pid)  # slow, so the process still runs meanwhile
-    scope = image.scope(objects or _own_objects(pid, image))
+    try:
+        image = Image(pid)  # slow, so the process still runs meanwhile
+        scope = image.scope(objects or _own_objects(pid, image))
+    except PermissionError as error:  # the process may have forbidden it: PR_SET_DUMPABLE
+        raise TracingForbidden.of(error) from None
     entry = None if function is None else image.address(image.function(function, scope.objects))
     if repeat is not None:
         record.require_same_build(repeat, image)

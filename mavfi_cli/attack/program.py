@@ -9,7 +9,6 @@ import contextlib
 import os
 import resource
 import signal
-import stat
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,7 +31,7 @@ from mavfi_cli.attack.profile import (
 from mavfi_cli.attack.target import RunLimits, RunVerdict, judged, signal_name
 from mavfi_cli.attack.work_folder import WorkFolder
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.core.files import Json, ScratchFolder
+from mavfi_cli.core.files import Json, ScratchFolder, gains_rights
 from mavfi_cli.core.processes import Ended
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.image import Image, Scope
@@ -46,7 +45,7 @@ def _require_attackable(path: Path) -> None:
     """Raise an error if a program cannot be attacked.
 
     Raises:
-        TargetError: the program is a script, set-uid or set-gid, or built for another processor.
+        TargetError: the program is a script, gains rights, or is built for another processor.
     """
     with path.open("rb") as file:
         head = file.read(256)
@@ -60,11 +59,12 @@ def _require_attackable(path: Path) -> None:
         )
     if head[:5] != b"\x7fELF\x02" or head[18:20] != b"\x3e\0":
         raise TargetError(path.name, "is not a program for x86-64")
-    if path.stat().st_mode & (stat.S_ISUID | stat.S_ISGID):
+    if gains_rights(path):
         raise TargetError(
             path.name,
-            "is set-uid or set-gid: it would lose these rights under the tracer, and must not "
-            "hold them while its state is corrupted; attack a copy without them",
+            "is set-uid or set-gid or has file capabilities: it would lose these rights under the "
+            "tracer, and must not hold them while its state is corrupted; attack a copy without "
+            "them",
         )
 
 

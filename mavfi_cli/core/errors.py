@@ -213,6 +213,12 @@ class FaultSpecError(FaultError):
     """The description of a fault is invalid or contradicts itself."""
 
 
+_ALLOW_TRACING = (
+    "run as the parent of the target, set kernel.yama.ptrace_scope to 0 or 1, or start the "
+    "container with --cap-add=SYS_PTRACE"
+)
+
+
 class TracingForbidden(FaultError):
     """The operating system does not allow mavfi to trace a process.
 
@@ -226,6 +232,11 @@ class TracingForbidden(FaultError):
 
     def __init__(self, what: str, problem: str, remedy: str) -> None:
         super().__init__(f"{what} is not possible here ({problem}): {remedy}")
+
+    @classmethod
+    def of(cls, error: PermissionError) -> Self:
+        """Explain a refusal of ptrace, or of a process's files in /proc."""
+        return cls("tracing a process", str(error), _ALLOW_TRACING)
 
 
 class TargetError(FaultError):

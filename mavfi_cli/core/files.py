@@ -292,6 +292,18 @@ def _remove_abandoned(place: Path) -> None:
                 os.close(lock)
 
 
+def gains_rights(program: Path) -> bool:
+    """Return True if a program gets rights that its user lacks.
+
+    It does if it is set-uid or set-gid, or has file capabilities.
+    """
+    try:
+        os.getxattr(program, "security.capability")
+    except OSError:  # it has none, or the file system stores none
+        return bool(program.stat().st_mode & (stat.S_ISUID | stat.S_ISGID))
+    return True
+
+
 def require_output(path: Path, suffixes: Sequence[str] = ()) -> None:
     """Raise an error if a file cannot be written. Call it before computing the contents.
 

@@ -163,7 +163,9 @@ class RunningProgram:
                 line = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
                 name, *words = map(os.fsdecode, line)
                 script = next((word for word in words if not word.startswith("-")), "")
-                files = [os.readlink(f"/proc/{pid}/exe"), name, script]
+                files = [name, script]
+                with contextlib.suppress(PermissionError):  # it forbids to trace it
+                    files.append(os.readlink(f"/proc/{pid}/exe"))
                 if executable in [Path(file).name for file in files]:
                     return pid
         return None

@@ -9,13 +9,13 @@ import os
 import re
 import shlex
 import shutil
-import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mavfi_cli.core.config import load_toml
 from mavfi_cli.core.errors import ConfigError, LinkError, UnknownName
+from mavfi_cli.core.files import gains_rights
 from mavfi_cli.core.types import StackMark
 
 RESTARTS = ("never", "on-failure", "always")
@@ -378,7 +378,7 @@ class CompanionConfig:
 
 
 def _require_startable(name: str, program: ProgramConfig) -> None:
-    """Reject a program whose folder or executable is missing, or that is set-uid or set-gid."""
+    """Reject a program whose folder or executable is missing, or that gains rights."""
     word = _words(program.command)[0]
     if not Path(program.folder).is_dir():
         raise ConfigError(f"no such folder: {program.folder}", key=f"program.{name}.folder")
@@ -388,6 +388,9 @@ def _require_startable(name: str, program: ProgramConfig) -> None:
         raise ConfigError(
             f"program {word!r} was not found or is not executable", key=f"program.{name}"
         )
-    if os.stat(binary).st_mode & (stat.S_ISUID | stat.S_ISGID):
-        problem = f"{word} is set-uid or set-gid, so mavfi could neither end nor attack it"
+    if gains_rights(Path(binary)):
+        problem = (
+            f"{word} is set-uid or set-gid or has file capabilities, so mavfi could neither end "
+            "nor attack it"
+        )
         raise ConfigError(problem, key=f"program.{name}")

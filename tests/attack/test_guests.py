@@ -1,5 +1,6 @@
 """Programs that misbehave or cannot be attacked: each ends with one clear line."""
 
+import contextlib
 import json
 import os
 import re
@@ -16,6 +17,8 @@ from mavfi_cli.attack.target import RunLimits
 from mavfi_cli.cli.kernels import kernels
 from mavfi_cli.core.errors import MavfiError, TargetError
 from mavfi_cli.fi.tracer.spawn import Program
+
+CAP_NET_RAW = b"\1\0\0\2\0\x20" + bytes(14)  # struct vfs_cap_data of linux/capability.h
 
 
 @pytest.fixture
@@ -94,6 +97,9 @@ def test_a_set_uid_program(attack, native_program, tmp_path):
     assert "is set-uid or set-gid" in refused(attack(program=path))
     path.chmod(0o755)
     assert attack("30", program=path).exit_code == 0
+    with contextlib.suppress(PermissionError):  # only root may
+        os.setxattr(path, "security.capability", CAP_NET_RAW)
+        assert "has file capabilities" in refused(attack(program=path))
 
 
 def test_a_program_for_another_processor(attack, native_program, tmp_path):

@@ -1,7 +1,9 @@
 """Faults at a moment, in a process with several threads that runs by the wall clock."""
 
 import contextlib
+import ctypes
 import faulthandler
+import os
 import subprocess
 import sys
 import threading
@@ -14,7 +16,8 @@ from live_processes import LONG_S
 
 from mavfi_cli.attack.live import _Search, attack_moment
 from mavfi_cli.attack.tracer_thread import TracerThread
-from mavfi_cli.core.errors import TargetError, UnknownName
+from mavfi_cli.core.errors import FaultError, TargetError, TracingForbidden, UnknownName
+from mavfi_cli.core.processes import fork
 from mavfi_cli.fi.tracer import record, stepper
 from mavfi_cli.fi.tracer.fault import Strategy
 from mavfi_cli.fi.tracer.image import Image
@@ -103,6 +106,34 @@ def test_what_cannot_be_struck(workers, tmp_path):
     workers.kill()
     with contextlib.suppress(TargetError):  # it was killed before its thread had stopped
         assert tracer.result().record["not_injected_reason"] == "the process ended"
+
+
+def test_a_process_whose_files_cannot_be_read_cannot_be_traced(workers, tmp_path):
+    """As without CAP_SYS_PTRACE, if the process has set PR_SET_DUMPABLE to 0."""
+
+    def from_another_user_namespace():
+        if ctypes.CDLL(None).unshare(0x1000_0000) != 0:
+            return 77
+        with pytest.raises(TracingForbidden, match=r"'/proc/.*--cap-add=SYS_PTRACE"):
+            attack_moment(
+                workers.pid, UNIFORM, np.random.default_rng(0), path=tmp_path / "fault.json"
+            )
+        return 0
+
+    _, status = os.waitpid(fork(from_another_user_namespace), 0)
+    if (code := os.waitstatus_to_exitcode(status)) == 77:
+        pytest.skip("no user namespaces are allowed here")
+    assert code == 0
+
+
+def test_a_program_without_symbols_has_no_function_to_choose(native_program, tmp_path):
+    stripped = tmp_path / "stripped"
+    subprocess.run(["strip", "-o", stripped, native_program("workers")], check=True)
+    with subprocess.Popen([stripped], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        with pytest.raises(FaultError, match="stripped: no function 'work': no symbol table"):
+            strike(process, tmp_path, objects=("stripped",), function="work")
+        process.kill()
 
 
 def test_a_program_that_is_killed_while_its_thread_is_stopped_ends_the_fault(

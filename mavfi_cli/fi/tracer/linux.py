@@ -46,10 +46,6 @@ _personality.argtypes = [ctypes.c_ulong]
 
 _SHORTEST_WAIT_S = 0.001  # of a timer
 SUPPORTED = platform.system() == "Linux" and platform.machine() == "x86_64"
-_REMEDY = (
-    "run as the parent of the target, set kernel.yama.ptrace_scope to 0 or 1, or start the "
-    "container with --cap-add=SYS_PTRACE"
-)
 
 
 class _IoVector(ctypes.Structure):
@@ -97,7 +93,7 @@ def seize(tid: int, *, kill_with_tracer: bool) -> None:
     try:
         request(SEIZE, tid, 0, options)
     except PermissionError as error:
-        raise TracingForbidden("tracing a process", str(error), _REMEDY) from None
+        raise TracingForbidden.of(error) from None
 
 
 def require_permission() -> None:
