@@ -55,11 +55,10 @@ def gate(file: str | None, process: str | None, **options: Any) -> None:
 
     Everything else passes byte for byte. Alarms are printed, and sent as STATUSTEXT.
     """
-    from mavfi_cli.mission.gate_process import GateProcess, require_process
+    from mavfi_cli.mission.gate_process import GateProcess
     from mavfi_cli.spec.companion import CompanionConfig, GateConfig
     from mavfi_cli.spec.detector import DetectorConfig
 
-    require_process(process)
     model = options["model"]
     detector = DetectorConfig(
         name=options["detector"], threshold=options["threshold"],

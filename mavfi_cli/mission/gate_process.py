@@ -67,8 +67,11 @@ class GateProcess:
         """Run the gate until it is interrupted, and return the exit code for this process.
 
         Raises:
-            MavfiError: A link cannot be opened, or the model cannot be used.
+            MavfiError: The companion's process is gone, a link cannot be opened, or the model
+                cannot be used.
         """
+        if why := _Watch(self.process).gone():
+            raise MavfiError(why)
         SetpointGate.warm_up(self.detector, self.mark)
         log = None
         if self.log is not None:
@@ -230,12 +233,10 @@ class _Watch:
             if self._watch is None:
                 self._watch, self._number = EndWatch(number), number
             self._gone = gone if self._watch.look() else ""
-        except (MavfiError, OSError, ValueError):
+        except OSError:
             self._gone = gone
+        except (MavfiError, ValueError) as error:
+            problem = error if isinstance(error, MavfiError) else f"{self._process}: not a number"
+            known = "gone" if self._watch is not None else "unknown"
+            self._gone = f"the companion's process is {known} ({problem})"
         return self._gone
-
-
-def require_process(process: str | None) -> None:
-    """Raise MavfiError if a process is to be watched but is not running."""
-    if why := _Watch(process).gone():
-        raise MavfiError(why)

@@ -30,7 +30,6 @@ from mavfi_cli.link.router import Side
 from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.tlog import TlogWriter
 from mavfi_cli.mission import gate_process
-from mavfi_cli.mission.gate_process import require_process
 from mavfi_cli.mission.setpoint_gate import SetpointGate
 from mavfi_cli.mission.setpoints import SetpointView, command_of, samples_of_tlog
 from mavfi_cli.spec.companion import CompanionConfig, GateConfig
@@ -369,13 +368,23 @@ def test_a_tlog_gives_the_samples_of_its_setpoints(tmp_path):
 def test_a_process_is_gone_before_its_parent_has_awaited_it():
     process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     try:
-        require_process(str(process.pid))
+        assert gate_process._Watch(str(process.pid)).gone() == ""
         process.stdin.close()
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-        with pytest.raises(MavfiError, match="is gone"):
-            require_process(str(process.pid))
+        assert "is gone" in gate_process._Watch(str(process.pid)).gone()
     finally:
         process.wait()
+
+
+@pytest.mark.parametrize("text", [None, "seven\n"])
+def test_a_file_that_names_no_process_is_called_so(tmp_path, text):
+    path = tmp_path / "mine.pid"
+    if text is not None:
+        path.write_text(text)
+    done = CliRunner().invoke(gate_command, ["--process", str(path)])
+    assert isinstance(done.exception, MavfiError)
+    problem = "No such file or directory" if text is None else "not a number"
+    assert str(done.exception) == f"the companion's process is unknown ({path}: {problem})"
 
 
 def test_a_process_that_has_ended_stays_gone_although_its_id_is_used_again(tmp_path, monkeypatch):

@@ -317,6 +317,7 @@ class Image:
 
         Raises:
             UnknownName: no object has this function; the message suggests the nearest name.
+            FaultError: the objects have no symbols.
         """
         known: list[str] = []
         for loaded in map(self.named, objects):
@@ -324,6 +325,8 @@ class Image:
             if function is not None:
                 return Location(loaded.name, function.start)
             known += [function.name for function in loaded.functions]
+        if not known:
+            raise FaultError(f"{', '.join(objects)}: no function {name!r}: no symbol table")
         raise UnknownName("function", name, known[:200])
 
     def scope(self, objects: Iterable[str]) -> Scope:
