@@ -60,6 +60,7 @@ class Router:
 
     Attributes:
         port: Local port of the companion's link if that listens. For port 0 the system chooses one.
+        sender: Peer whose message `passes` is called with; None outside that call.
 
     Raises:
         LinkError: A link cannot be opened.
@@ -77,6 +78,7 @@ class Router:
         self.signing = signing
         self._passes = passes or (lambda message, _side: (frame_of(message),))
         self.peers: Peers[_Program] = Peers(signing=signing, allow_unsigned=allow_unsigned)
+        self.sender: Peer | None = None
         self._senders: dict[tuple[int, int], _Program] = {}  # newest, by system and component
         make = partial(_Program, router=self)
         self.peers.open(autopilot, partial(make, side=Side.AUTOPILOT))
@@ -103,7 +105,10 @@ class Router:
     def receive(self, message: Message, sender: _Program) -> None:
         """Forward the frames that `passes` returns for a received message."""
         self._senders[message.get_srcSystem(), message.get_srcComponent()] = sender
-        for frame in self._passes(message, sender.side):
+        self.sender = sender
+        frames = [*self._passes(message, sender.side)]
+        self.sender = None
+        for frame in frames:
             self.send(frame, sender.side, sender)
 
     def send_late(self, frame: bytes, side: Side, message: Message) -> None:

@@ -226,7 +226,7 @@ class CompanionFlight:
         """
         if self._gate is None:
             return (message,)
-        passed = self._gate.pass_between(message, side, self.stamp_s)
+        passed = self._gate.pass_between(message, side, self.stamp_s, self._router.sender)
         if message not in passed and self.injection.link is not None:
             self.injection.link.follower.withheld(message)
         for frame in self._gate.outbox:
@@ -321,8 +321,9 @@ class CompanionFlight:
             self._crew.hear(message.get_srcSystem(), message.get_srcComponent())
         if message.get_msgId() not in SETPOINTS:
             return
+        another, sender = self._commanders.another, self._router.sender
         # The gate notes it, if there is one.
-        if self._gate is None and (text := self._commanders.another(message)):
+        if self._gate is None and (text := another(message, sender)):
             self.logger.note(self.stamp_s, "program", text, self.telemetry.state)
         if message.get_msgId() == _SETPOINT and self.telemetry.state is not None:
             self._command = command_of(message, self.telemetry)

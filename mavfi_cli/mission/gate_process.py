@@ -148,7 +148,7 @@ class _Worker:
         gate = self._gate
         if judges:
             self._passing.rule = lambda message, side: gate.pass_between(
-                message, side, time.monotonic()
+                message, side, time.monotonic(), self._router.sender
             )
         elif self._process.settings.on_error == "closed":
             self._passing.rule = _closed

@@ -19,6 +19,7 @@ from mavfi_cli.core.errors import described
 from mavfi_cli.core.types import Command, StackMark, Stage, Trajectory
 from mavfi_cli.detect.gate import Alarm, Gate
 from mavfi_cli.link.codec import Codec, Message, Signing, dialect, frame_of, renewed, text_messages
+from mavfi_cli.link.peers import Peer
 from mavfi_cli.link.router import Side
 from mavfi_cli.mission.setpoints import SETPOINTS, SetpointView
 from mavfi_cli.spec.companion import GateConfig
@@ -108,8 +109,14 @@ class SetpointGate:
         for trajectory in (None, plan):
             gate.judge_tick(trajectory, 0, still)
 
-    def pass_between(self, message: Message, side: Side, now_s: float) -> list[Message]:
-        """Return the messages to pass on in place of a message: usually the message itself."""
+    def pass_between(
+        self, message: Message, side: Side, now_s: float, sender: Peer | None = None
+    ) -> list[Message]:
+        """Return the messages to pass on in place of a message: usually the message itself.
+
+        Args:
+            sender: Peer that has sent the message; None if it is not known.
+        """
         number = message.get_msgId()
         if side is Side.COMPANION and number not in SETPOINTS:
             if number == dialect.MAVLINK_MSG_ID_HEARTBEAT:
@@ -119,7 +126,7 @@ class SetpointGate:
             if side is Side.AUTOPILOT:
                 self._view.hear(message)
                 return [message]
-            return self._judge(message, now_s)
+            return self._judge(message, now_s, sender)
         except Exception as error:  # the gate's boundary: it fails as configured
             if not self._failed:
                 self._say(f"gate fails {self._settings.on_error}: {described(error)}", math.inf)
@@ -127,8 +134,8 @@ class SetpointGate:
             passes = side is Side.AUTOPILOT or self._settings.on_error == "open"
             return [message] if passes else []
 
-    def _judge(self, message: Message, now_s: float) -> list[Message]:
-        if text := self._commanders.another(message):
+    def _judge(self, message: Message, now_s: float, sender: Peer | None) -> list[Message]:
+        if text := self._commanders.another(message, sender):
             self._say(text, math.inf, "program")
         if why := self._staleness(message, now_s):
             self._counts.stale += 1

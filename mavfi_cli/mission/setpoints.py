@@ -23,6 +23,7 @@ import numpy as np
 from mavfi_cli.core.types import Command, Trajectory, VehicleState
 from mavfi_cli.detect.offline import FlightSamples
 from mavfi_cli.link.codec import Message, dialect
+from mavfi_cli.link.peers import Peer
 from mavfi_cli.link.telemetry import ARDUCOPTER, AUTOPILOT, Telemetry
 from mavfi_cli.link.tlog import EPOCH_UNIX_S, tlog_messages
 
@@ -53,19 +54,33 @@ class SetpointView:
         """The senders of setpoints on a link, of which a vehicle should have only one."""
 
         def __init__(self) -> None:
-            self._senders: set[tuple[int, int]] = set()
+            self._peers: dict[tuple[int, int], list[Peer]] = {}  # the newest two of each sender
+            self._shared: set[tuple[int, int]] = set()
 
-        def another(self, setpoint: Message) -> str:
+        def another(self, setpoint: Message, peer: Peer | None) -> str:
             """Return a text if a setpoint comes from a further sender, otherwise an empty string.
 
-            At most 100 senders are known, so a flood of senders does not cause a flood of texts.
+            Two peers with the same system and component are two senders once the first sends again
+            after the second. Until then, the second may be the first, started again. At most 100
+            senders are known, so a flood of senders does not cause a flood of texts.
+
+            Args:
+                peer: Peer that has sent the setpoint; None if it is not known.
             """
             sender = setpoint.get_srcSystem(), setpoint.get_srcComponent()
-            if sender in self._senders or len(self._senders) >= _MOST_COMMANDERS:
+            is_new = sender not in self._peers
+            if is_new and len(self._peers) >= _MOST_COMMANDERS:
                 return ""
-            self._senders.add(sender)
-            text = f"another commander, {sender[0]}/{sender[1]}, sends setpoints"
-            return text if len(self._senders) > 1 else ""
+            peers = self._peers.setdefault(sender, [])
+            shares = peer in peers[:-1] and sender not in self._shared
+            if shares:
+                self._shared.add(sender)
+            elif peer is not None and peer not in peers:
+                self._peers[sender] = [*peers[-1:], peer]
+            if not (shares or (is_new and len(self._peers) > 1)):
+                return ""
+            also = "also " if shares else ""
+            return f"another commander, {also}{sender[0]}/{sender[1]}, sends setpoints"
 
     def __init__(self) -> None:
         self.telemetry = Telemetry()

@@ -110,6 +110,18 @@ def test_the_owner_decides_what_goes_on(scene):
     assert seen == [("HEARTBEAT", Side.COMPANION), ("HEARTBEAT", Side.AUTOPILOT)]
 
 
+def test_the_owner_tells_programs_with_the_same_ids_apart(scene):
+    senders = []
+    router, _, programs = scene(programs=2, passes=lambda *_: senders.append(router.sender) or ())
+    for program in (*programs, *programs):
+        program.send(PROGRAM.encode(HEARTBEAT))
+        run(router, 2)
+    one, other = senders[:2]
+    assert one is not other
+    assert senders == [one, other, one, other]
+    assert router.sender is None
+
+
 def test_a_closed_autopilot_ends_the_router(scene):
     router, autopilot, _ = scene()
     run(router, 1)

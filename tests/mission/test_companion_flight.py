@@ -163,9 +163,10 @@ def test_a_vehicle_with_a_key_obeys_only_a_companion_that_signs(fly, tmp_path, s
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("gated", [False, True])
-def test_another_commander_is_told_once(fly, gated):
-    second = f"[program.second]\ncommand = '{sys.executable} {HOP} {{link}} {SPEED} lands 190'\n"
+@pytest.mark.parametrize(("gated", "component"), [(False, 190), (True, 190), (False, 191)])
+def test_another_commander_is_told_once(fly, gated, component):
+    hop = f"{sys.executable} {HOP} {{link}} {SPEED} lands {component}"
+    second = f"[program.second]\ncommand = '{hop}'\n"
     run = fly("lands", program=second, gated=gated)
     kinds = [event.kind for event in run.record.events if "sends setpoints" in event.text]
     assert kinds == ["program"]

@@ -263,6 +263,18 @@ def test_setpoints_of_a_gone_companion_end_beside_those_of_another_commander(gat
     assert own.said[0] == "another commander, 1/190, sends setpoints"
 
 
+def test_two_peers_with_the_same_ids_are_two_commanders_unless_one_succeeds_the_other(gate):
+    own, first, second, third = gate(), object(), object(), object()
+
+    def tell(*peers):
+        for peer in peers:
+            own.pass_between(setpoint(), Side.COMPANION, 2.0, peer)
+        return own.said
+
+    assert tell(first, first, second, second, third, None, third) == []  # started again, twice
+    assert tell(second, third, second) == ["another commander, also 1/191, sends setpoints"]
+
+
 def test_a_flood_of_senders_fills_no_memory(gate):
     own = gate()
     for system in range(1, 251):
