@@ -423,7 +423,9 @@ class _Run:
             wanted, stop, cells, over(), shares=shares, drawn=drawn, stopped=stopped
         )
         self._again: list[MissingMission] = []
-        self._checks_network = self._jobs > 1 and options.cluster is None
+        self._parallel = self._jobs > 1 and options.cluster is None
+        self._leaves_network: bool | None = None  # None: not tried yet
+        self._noted: set[str] = set()
         self._alone: dict[int, str] = {}  # reasons why missions do not share a flight
         self._flying: dict[int, MissingMission] = {}
         self._attempts: Counter[int] = Counter()
@@ -488,12 +490,14 @@ class _Run:
             missions = self._next()
             if not missions:
                 return
+            if self._must_wait(missions[0].config):
+                self._again += missions
+                return
             attempts: list[Attempt] = []
             alone = self._alone.pop(missions[0].number, "")
             for mission in missions:
                 number, _, config = mission
                 config.require_programs(*self._options.programs)
-                self._note_shared_network(config)
                 self._attempts[number] += 1
                 self._flying[number] = mission
                 attempts.append((number, changes_of(config), self._made(number)))
@@ -513,16 +517,38 @@ class _Run:
         most = min(SHARING, math.ceil(left / self._jobs))  # so that the last flights end together
         return [mission, *self._queue.mates(mission, most - 1)]
 
-    def _note_shared_network(self, config: MissionConfig) -> None:
-        """Tell the user, once, if missions of a user's companion must share this network."""
-        if not self._checks_network or config.companion is None:
-            return
-        self._checks_network = False
-        if CompanionConfig.load(config.companion).own_network and not _may_leave_network():
-            self._spectator.on_note(
-                "no network namespaces are allowed here, so missions share the machine's ports: "
-                "a companion with a fixed port needs --jobs 1"
+    def _must_wait(self, config: MissionConfig) -> bool:
+        """Return True if a mission of a user's companion must wait for a port of this machine.
+
+        That is so while another such mission flies, if the companion has a fixed port and its
+        missions have no networks of their own. Tell the user, once.
+        """
+        if not self._parallel or config.companion is None:
+            return False
+        companion = CompanionConfig.load(config.companion)
+        if companion.own_network and self._leaves_network is None:
+            self._leaves_network = _may_leave_network()
+        if companion.own_network and self._leaves_network:
+            return False
+        why, ports = "no network namespaces are allowed here", companion.fixed_ports
+        if not companion.own_network:
+            why = f"{config.companion} sets own_network = false"
+        if ports:
+            self._note_once(
+                f"{why}, so missions that use port {' and '.join(map(str, ports))} of this machine "
+                "fly one at a time"
             )
+        elif companion.own_network:
+            self._note_once(
+                f"{why}, so missions share the machine's ports: a companion with a fixed port "
+                "needs --jobs 1"
+            )
+        return bool(ports) and any(own.config.companion for own in self._flying.values())
+
+    def _note_once(self, text: str) -> None:
+        if text not in self._noted:
+            self._noted.add(text)
+            self._spectator.on_note(text)
 
     def _note_unforked(self, over: Sequence[AttemptEnd]) -> None:
         """Remember which missions could not be forked, and why, so that they are flown alone."""

@@ -309,6 +309,14 @@ class CompanionConfig:
         return self.link
 
     @property
+    def fixed_ports(self) -> list[int]:
+        """Ports of this machine that every flight uses: of the link, and of ready programs."""
+        from mavfi_cli.link.endpoint import parse_endpoint
+
+        ports = [parse_endpoint(self.url).port, *(own.ready_port for own in self.program.values())]
+        return [port for port in ports if port]
+
+    @property
     def mark(self) -> StackMark:
         """Identity that detector models of this companion store: its name, and a digest.
 

@@ -418,6 +418,32 @@ def test_a_machine_without_network_namespaces_is_told_once(tmp_path, monkeypatch
     assert told.endswith("a companion with a fixed port needs --jobs 1")
 
 
+BINDS = """
+import socket, time
+with socket.create_server(("127.0.0.1", {port})):
+    time.sleep(3.0)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key", ["own_network = false\n", ""])
+def test_missions_that_share_a_fixed_port_fly_one_at_a_time(tmp_path, monkeypatch, free_port, key):
+    monkeypatch.setattr(runner, "_may_leave_network", lambda: False)
+    (tmp_path / "binds.py").write_text(BINDS.format(port=free_port))
+    companion = tmp_path / "binds.toml"
+    companion.write_text(
+        f"{key}[program.binds]\ncommand = '{sys.executable} binds.py'\nready_port = {free_port}\n"
+    )
+    config = MissionConfig(companion=str(companion), world="farm", speed=SPEED)
+    missions = [PlannedMission(config=replace(config, seed=seed)) for seed in (1, 2, 3)]
+    notes = Notes()
+    with run_campaign(missions, tmp_path / "campaign", Options(jobs=3), notes) as ledger:
+        assert [row.outcome for row in ledger.results()] == ["success"] * 3
+    [told] = notes.texts
+    why = "binds.toml sets own_network = false" if key else "no network namespaces are allowed here"
+    assert f"{why}, so missions that use port {free_port} of this machine fly one at a time" in told
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not runner._may_leave_network(), reason="no network namespaces here")
 @pytest.mark.parametrize("own", [True, False])
