@@ -28,6 +28,11 @@ from mavfi_cli.spec.detector import DetectorConfig
 _COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER4  # sender of the gate's own messages
 _SILENT_S = 3.0  # wall-clock time without a heartbeat after which its sender is gone
 _TEXT_EVERY_S = 1.0
+_BLIND_S = 3.0  # time of setpoints without the vehicle's state until the gate says so
+_BLIND = (
+    "the autopilot has not sent HEARTBEAT, LOCAL_POSITION_NED and ATTITUDE: setpoints are judged "
+    "without the vehicle's state"
+)
 _MOST_ALARMS, _MOST_STREAMS = 100, 16
 _BRAKE = 0b1101_1100_0111  # type_mask of a velocity-only setpoint
 
@@ -92,6 +97,8 @@ class SetpointGate:
         self._commanders = SetpointView.Commanders()
         self._failed = False
         self._withheld = False  # what was last said of a setpoint
+        self._blind_s = math.inf  # stamp of the first setpoint without the vehicle's state
+        self._told_blind = False
         self.outbox: list[bytes] = []
 
     @staticmethod
@@ -146,6 +153,10 @@ class SetpointGate:
             return []
         self._checks += 1
         sample = self._view.sample(message)
+        if sample[0] is None and not self._told_blind:
+            self._blind_s = min(self._blind_s, now_s)
+            if now_s - self._blind_s > _BLIND_S:
+                self._told_blind = self._say(_BLIND, math.inf)
         alarm = self._gate.judge_tick(*sample)
         if alarm is None:
             if self._withheld and self._say("setpoints pass again", now_s):

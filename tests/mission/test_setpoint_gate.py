@@ -29,7 +29,7 @@ from mavfi_cli.link.codec import Codec, Signing, dialect, frame_of, key_from_pas
 from mavfi_cli.link.router import Side
 from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.tlog import TlogWriter
-from mavfi_cli.mission import gate_process
+from mavfi_cli.mission import gate_process, setpoint_gate
 from mavfi_cli.mission.setpoint_gate import SetpointGate
 from mavfi_cli.mission.setpoints import SetpointView, command_of, samples_of_tlog
 from mavfi_cli.spec.companion import CompanionConfig, GateConfig
@@ -273,6 +273,18 @@ def test_two_peers_with_the_same_ids_are_two_commanders_unless_one_succeeds_the_
 
     assert tell(first, first, second, second, third, None, third) == []  # started again, twice
     assert tell(second, third, second) == ["another commander, also 1/191, sends setpoints"]
+
+
+def test_setpoints_without_the_vehicles_state_are_told_once(model):
+    said = []
+    detector = DetectorConfig(name="range", model=str(model))
+    own = SetpointGate(detector, GateConfig(), MARK, note=lambda _, text: said.append(text))
+    for tick in range(100):
+        assert own.pass_between(setpoint(), Side.COMPANION, 0.1 * tick)
+        assert bool(said) == (tick > 30)
+    assert said == [setpoint_gate._BLIND]
+    texts = [m.text for frame in own.outbox for m in Codec(0, 0).decode(frame)]
+    assert "LOCAL_POSITION_NED" in "".join(texts)
 
 
 def test_a_flood_of_senders_fills_no_memory(gate):
