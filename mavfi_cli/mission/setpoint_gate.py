@@ -27,7 +27,7 @@ from mavfi_cli.spec.detector import DetectorConfig
 
 _COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER4  # sender of the gate's own messages
 _SILENT_S = 3.0  # wall-clock time without a heartbeat after which its sender is gone
-_TEXT_EVERY_S = 1.0
+_TEXT_EVERY_S, _STALE_EVERY_S = 1.0, 60.0
 _BLIND_S = 3.0  # time of setpoints without the vehicle's state until the gate says so
 _BLIND = (
     "the autopilot has not sent HEARTBEAT, LOCAL_POSITION_NED and ATTITUDE: setpoints are judged "
@@ -47,6 +47,15 @@ class _Counts:
     stale: int = 0  # nothing, unless the gate only watches: the companion is gone
     none: int = 0  # the setpoint itself: the gate only watches
     alarms: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class _Stream:
+    """The newest setpoint of one sender and kind."""
+
+    content: tuple[str, ...]
+    since_s: float  # since when it is the same
+    told_s: float = -math.inf  # when it was last said that it is stale
 
 
 class SetpointGate:
@@ -92,8 +101,7 @@ class SetpointGate:
         self._noted_s = self._handed_s = -math.inf
         self._silent_s = _SILENT_S * speed
         self._heartbeats: dict[tuple[int, int], float] = {}  # newest, by system and component
-        # Newest setpoint and the time since which it is the same, by sender and message id.
-        self._steady: dict[tuple[int, int, int], tuple[tuple[str, ...], float]] = {}
+        self._steady: dict[tuple[int, int, int], _Stream] = {}  # by sender and message id
         self._commanders = SetpointView.Commanders()
         self._failed = False
         self._withheld = False  # what was last said of a setpoint
@@ -144,13 +152,9 @@ class SetpointGate:
     def _judge(self, message: Message, now_s: float, sender: Peer | None) -> list[Message]:
         if text := self._commanders.another(message, sender):
             self._say(text, math.inf, "program")
-        if why := self._staleness(message, now_s):
+        if self._is_stale(message, now_s):
             self._counts.stale += 1
-            if self._settings.watch_only:
-                self._say(f"{why}: its setpoints pass", now_s)
-                return [message]
-            self._say(f"{why}: its setpoints are withheld", now_s)
-            return []
+            return [message] if self._settings.watch_only else []
         self._checks += 1
         sample = self._view.sample(message)
         if sample[0] is None and not self._told_blind:
@@ -184,8 +188,8 @@ class SetpointGate:
         self._counts.brake += 1
         return self._standstill(message)
 
-    def _staleness(self, message: Message, now_s: float) -> str:
-        """Return why a setpoint is stale, or an empty string if it is not.
+    def _is_stale(self, message: Message, now_s: float) -> bool:
+        """Return True if a setpoint is stale. Say so once, and then every minute.
 
         Setpoints are stale if their sender no longer changes them, and the companion is gone or
         this sender sends no more heartbeats.
@@ -194,17 +198,23 @@ class SetpointGate:
         content = tuple(  # as text, because NaN differs from itself
             repr(getattr(message, name)) for name in message.fieldnames if name != "time_boot_ms"
         )
-        stream = (*sender, message.get_msgId())
-        before, since_s = self._steady.pop(stream, (None, now_s))
-        self._steady[stream] = content, since_s if content == before else now_s
+        key = (*sender, message.get_msgId())
+        stream = self._steady.pop(key, None)
+        if stream is None or stream.content != content:
+            stream = _Stream(content, now_s)
+        self._steady[key] = stream
         if len(self._steady) > _MOST_STREAMS:
             del self._steady[next(iter(self._steady))]  # the one that has been silent longest
-        if now_s - self._steady[stream][1] < self._settings.stale_s:
-            return ""
-        if why := self._gone():
-            return why
-        silent = now_s - self._heartbeats.get(sender, now_s) > self._silent_s
-        return "the companion's heartbeat is gone" if silent else ""
+        if now_s - stream.since_s < self._settings.stale_s:
+            return False
+        why = self._gone()
+        if not why and now_s - self._heartbeats.get(sender, now_s) > self._silent_s:
+            why = "the companion's heartbeat is gone"
+        doing = "pass" if self._settings.watch_only else "are withheld"
+        is_due = now_s - stream.told_s >= _STALE_EVERY_S
+        if why and is_due and self._say(f"{why}: its setpoints {doing}", now_s):
+            stream.told_s = now_s
+        return bool(why)
 
     def _again(self, message: Message) -> list[Message]:
         """Return the last accepted setpoint, with the header and time of the withheld `message`.

@@ -250,6 +250,16 @@ def test_setpoints_of_a_companion_that_is_gone_end_once_they_no_longer_change(ga
     assert velocities(silent, [2.0] * 35) == [[2.0]] * 30 + [[]] * 5
 
 
+def test_setpoints_of_a_gone_companion_are_told_once_then_every_minute(gate):
+    own = gate(gone=lambda: "the program script is gone")
+    for tick in range(1300):
+        own.pass_between(setpoint(), Side.COMPANION, 2.0 + 0.1 * tick)
+    assert own.said == ["the program script is gone: its setpoints are withheld"] * 3
+    own.pass_between(setpoint(1.0), Side.COMPANION, 140.0)  # it is back
+    own.pass_between(setpoint(1.0), Side.COMPANION, 142.0)
+    assert len(own.said) == 4
+
+
 def test_setpoints_of_a_gone_companion_end_beside_those_of_another_commander(gate):
     own = gate(gone=lambda: "the program script is gone")
     passed = []
