@@ -11,6 +11,7 @@ import io
 import operator
 import os
 import pickle
+import re
 import select
 import signal
 import socket
@@ -25,6 +26,7 @@ PYTHON = (sys.executable, "-P")
 """Command line of this Python interpreter. `-P` prevents imports from the working directory."""
 
 _LENGTH = 8
+_COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")  # a terminal's colour code
 _NEW_USER, _NEW_NETWORK = 0x1000_0000, 0x4000_0000  # unshare(2)
 _SET_FLAGS, _UP = 0x8914, 0x1  # netdevice(7)
 # PIDFD_GET_INFO of linux/pidfd.h: the number, the mask and the last field of `struct pidfd_info`,
@@ -192,6 +194,19 @@ class Ended:
     def of(cls, code: int) -> Ended:
         """Convert an exit code as `subprocess` gives it, where a negative code is a signal."""
         return cls(exit_code=None, signal=-code) if code < 0 else cls(exit_code=code, signal=None)
+
+    @staticmethod
+    def last_lines(output: bytes, most: int) -> list[str]:
+        """Return the last lines of a process's output, without colours and control characters.
+
+        Blank lines are left out.
+
+        Args:
+            most: Largest number of lines.
+        """
+        text = _COLOUR.sub("", output.decode(errors="replace"))
+        lines = ("".join(filter(str.isprintable, line)).strip() for line in text.split("\n"))
+        return [line for line in lines if line][-most:]
 
     def describe(self) -> str:
         """Describe in words, for a record, how the process ended."""

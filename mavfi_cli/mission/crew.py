@@ -100,7 +100,8 @@ class Crew:
             if self._waiting:
                 self._start()
         elif program.codes and program.pid is None and self._is_over(name):
-            self.unready = f"{name} {_how(program.codes[-1])} before it was ready"
+            early = f"{name} {_how(program.codes[-1])} before it was ready"
+            self.unready = _with_words(early, program)
         elif time.monotonic() - self._started_s > config.ready_limit_s:
             self.unready = f"{name} was not ready within {config.ready_limit_s:g} s"
 
@@ -146,13 +147,13 @@ class Crew:
         return rule == "never" or (rule == "on-failure" and program.codes[-1] == 0)
 
     def failure(self) -> str:
-        """Describe the failure of a program that will not restart.
+        """Describe the failure of a program that will not restart, with its last line on stderr.
 
         Return an empty string if no program has failed like this.
         """
         for name, program in self.running.items():
             if program.codes and program.codes[-1] and self._is_over(name):
-                return f"{name} {_how(program.codes[-1])}"
+                return _with_words(f"{name} {_how(program.codes[-1])}", program)
         return ""
 
     def ended(self) -> str:
@@ -174,6 +175,11 @@ class Crew:
     def succeeded(self, name: str) -> bool:
         """Return True if the program has ended with exit code 0 and will not restart."""
         return name in self.running and self._is_over(name) and self.running[name].codes[-1] == 0
+
+
+def _with_words(text: str, program: RunningProgram) -> str:
+    words = program.last_words()
+    return f"{text}: {words}" if words else text
 
 
 def _how(code: int) -> str:

@@ -29,12 +29,14 @@ from typing import Any, BinaryIO, NoReturn
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import ScratchFolder, open_own, own_folder
 from mavfi_cli.core.fork_server import HALT, PACKET, ForkServer, die_with, users_environment
+from mavfi_cli.core.processes import Ended
 
 _EVENTS = "events.jsonl"
 _STREAMS = ("stdout", "stderr")
 _MOST_BYTES = 16 << 20  # kept per stream; the rest is read and dropped
 _CHUNK, _LOOK_S = 1 << 16, 0.05
 _MOST_LINE = 4096  # bytes of a line that are searched for readiness
+_TAIL, _MOST_WORDS = 8192, 200  # bytes of stderr that are read for the last line; its length
 _LONGEST_S = 1e6
 _GRACE_S = 2.0  # time to end after SIGTERM
 _PERIOD_S = 0.02  # cycle of running and stopping a slowed program
@@ -100,7 +102,7 @@ class RunningProgram:
     throttle: Throttle | None = None
 
     def __init__(self, name: str, folder: Path, channel: socket.socket, halt: Path) -> None:
-        self.name, self._halt = name, halt
+        self.name, self._halt, self._stderr = name, halt, folder / "stderr"
         self.pid: int | None = None
         self.codes: list[int] = []
         self.starts = 0
@@ -129,6 +131,16 @@ class RunningProgram:
             if report := (json.loads(packet).get("report") or {}):
                 return str(report.get("text") or report.get("traceback"))
         return "its process was killed"
+
+    def last_words(self) -> str:
+        """Return the last line, of at most 200 characters, that the program wrote to stderr.
+
+        The string is empty if it wrote none.
+        """
+        with open(open_own(self._stderr, os.O_RDONLY), "rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
+            lines = Ended.last_lines(file.read(_TAIL), 1)
+        return lines[0][:_MOST_WORDS] if lines else ""
 
     def signal(self, number: int, *, group: bool = False) -> bool:
         """Send signal `number` to the program's process, or to its process group.

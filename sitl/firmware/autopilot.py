@@ -6,7 +6,6 @@ import contextlib
 import functools
 import math
 import os
-import re
 import signal
 import subprocess
 import threading
@@ -20,6 +19,7 @@ from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.errors import LinkLost, VehicleProcessError
 from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.fork_server import die_with
+from mavfi_cli.core.processes import Ended
 from mavfi_cli.link.codec import (
     SLOW_STREAMS_US,
     STATE_STREAMS,
@@ -254,12 +254,6 @@ class Boot:
 _TAIL_LINES, _TAIL_BYTES = 5, 8192  # of output: lines in an error, bytes kept
 _CHUNK = 65_536
 _DEATH_S = 1.0
-_COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")  # a terminal's colour code
-
-
-def _plain(line: str) -> str:
-    """Return a line of output without colours and other control characters."""
-    return "".join(filter(str.isprintable, _COLOUR.sub("", line))).strip()
 
 
 class FirmwareProcess:
@@ -323,9 +317,8 @@ class FirmwareProcess:
         how = "is running" if code is None else f"ended with code {code}"
         if code is not None and code < 0:
             how = f"was killed by signal {-code}"
-        text = bytes(self._tail).decode(errors="replace")
-        lines = [line for raw in text.split("\n") if (line := _plain(raw))]
-        last = f": {' | '.join(lines[-_TAIL_LINES:])}" if lines else ""
+        lines = Ended.last_lines(bytes(self._tail), _TAIL_LINES)
+        last = f": {' | '.join(lines)}" if lines else ""
         return f"the firmware {self._binary} {how}{last}"
 
     def _keep_tail(self) -> None:

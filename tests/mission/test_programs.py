@@ -49,6 +49,21 @@ def test_a_program_has_its_outputs_environment_and_exit_code(start, tmp_path):
     folder = tmp_path / "program"
     assert (folder / "stdout").read_text() == "blue\n"
     assert (folder / "stderr").read_text() == "no\n"
+    assert program.last_words() == "no"
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        ("junk\nValueError: \x1b[31mno\x07 port" + 300 * "!" + "\n  \n",
+         "ValueError: no port".ljust(200, "!")),
+        ("", ""),
+    ],
+)  # fmt: skip
+def test_the_last_words_of_a_program_are_one_short_printable_line(start, error, words):
+    program = start(f"import sys; sys.stderr.write({error!r})")
+    awaited(program, lambda: program.codes)
+    assert program.last_words() == words
 
 
 def test_a_line_tells_readiness_before_the_end(start):
