@@ -216,7 +216,8 @@ def fly(
             raise click.UsageError(
                 "--golden needs --companion, because other flights repeat exactly"
             )
-        refuse_given({"expect", "record", "replay"}, "has no effect with --golden")
+        others = {"expect", "record", "replay", "inject", "detector"}
+        refuse_given(others, "has no effect with --golden")
         from mavfi_cli.studies.spread import fly_spread
 
         with progress_view(mission, quiet=quiet) as view:
@@ -324,9 +325,9 @@ def _replaced(base: MissionConfig, given: Given) -> MissionConfig:
     from mavfi_cli.spec.mission import OF_THE_WORLD, OWN_AUTOPILOT
 
     fault, instruction = _faults(base, given)
-    link = given.get("link", base.link)
+    link, companion = given.get("link", base.link), given.get("companion", base.companion)
     land = given.pop("land", base.land or (link is not None and base.link is None))
-    if link is not None and not given.get("eyes", base.eyes):
+    if link is not None and companion is None and not given.get("eyes", base.eyes):
         refuse_given(OF_THE_WORLD, "has no effect with --link unless --eyes is given")
     if given.get("autopilot", base.autopilot) == OWN_AUTOPILOT:
         refuse_given({"firmware"}, "needs --autopilot px4 or ardupilot")

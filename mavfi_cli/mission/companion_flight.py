@@ -183,7 +183,8 @@ class CompanionFlight:
     def _shortest_flight_s(self, briefing: Briefing) -> float:
         """Return the length in seconds of the interval from which a random fault time is drawn."""
         way_m = norm(briefing.goal_enu_m - briefing.start_enu_m)
-        return self._companion.flight_s or self._golden_s or way_m / self._config.v_max_mps
+        flight_s = self._companion.flight_s or self._golden_s or way_m / self._config.v_max_mps
+        return min(flight_s, self._time_limit_s)
 
     def _placeholders(
         self, folder: RunFolder, briefing: Briefing, depth: Path | None

@@ -290,6 +290,8 @@ class FaultConfig:
             number = float(amount or 0.0)
         except ValueError:
             raise FaultSpecError(f"effect {effect}= needs a number, got {amount!r}") from None
+        if not amount and effect in (Effect.LATE.value, Effect.SLOW.value):
+            raise FaultSpecError(f"effect {effect}: needs a number, as in {effect}=0.5")
         return Corruption(
             effect=named_member(Effect, "effect", effect),
             amount=number,

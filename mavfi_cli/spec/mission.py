@@ -171,10 +171,10 @@ class MissionConfig:
             self.fault.check_within(self.time_limit_s)
         if self.instruction is not None and self.companion is not None:
             self.instruction.moment().check_within(self.time_limit_s)
+        self._check_companion()
         self._check_link()
         self._check_platform()
         self._check_autopilot()
-        self._check_companion()
         for node in self.isolate:
             if node not in KERNELS:
                 raise UnknownName("node", node, KERNELS)

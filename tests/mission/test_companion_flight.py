@@ -26,6 +26,7 @@ from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ConfigError, MavfiError, ModelError, RecordError
 from mavfi_cli.core.flight_record import ProgramEnds
 from mavfi_cli.link.codec import Codec
+from mavfi_cli.mission.companion_flight import CompanionFlight
 from mavfi_cli.mission.crew import Crew
 from mavfi_cli.mission.run import fly_again
 from mavfi_cli.mission.run_folder import RunFolder
@@ -223,6 +224,16 @@ def test_a_corridor_around_the_golden_path(fly):
     strayed = fly("lands", success=near, world_seed=9)  # starts elsewhere
     assert strayed.record.outcome == "timeout"
     assert strayed.record.reason.endswith("m from the golden path")
+
+
+@pytest.mark.parametrize(("limit_s", "span_s"), [(300.0, 15.0), (5.0, 5.0)])
+def test_a_random_time_is_drawn_within_the_time_limit(limit_s, span_s):
+    flight = SimpleNamespace(
+        _companion=CompanionConfig(program={"a": ProgramConfig(command="true")}),
+        _config=MissionConfig(v_max_mps=3.0), _golden_s=None, _time_limit_s=limit_s,
+    )  # fmt: skip
+    way = SimpleNamespace(start_enu_m=np.zeros(3), goal_enu_m=np.array([45.0, 0.0, 0.0]))
+    assert CompanionFlight._shortest_flight_s(flight, way) == span_s
 
 
 def test_a_flight_that_stops_early_misses_a_part_of_the_golden_path(tmp_path):
