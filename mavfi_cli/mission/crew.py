@@ -159,8 +159,9 @@ class Crew:
     def ended(self) -> str:
         """Name a program that is gone, even if it will restart.
 
-        A program that has ended with exit code 0 is gone only if no other program runs. Return an
-        empty string if no program is gone.
+        A program that has ended with exit code 0 is gone only if `success.exit` names it or no
+        other program runs: it may have been a preparation. Return an empty string if no program is
+        gone.
         """
         down = {
             name: program.codes[-1]
@@ -168,7 +169,7 @@ class Crew:
             if program.codes and program.pid is None
         }
         for name, code in down.items():
-            if code or len(down) == len(self.running):
+            if code or name == self._companion.success.exit or len(down) == len(self.running):
                 return f"the program {name} is gone"
         return ""
 

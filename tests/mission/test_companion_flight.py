@@ -300,8 +300,10 @@ def test_a_corridor_alone_does_not_say_when_the_flight_is_over():
     assert CompanionConfig(program=program, success=near).success == replace(near, exit="a")
 
 
-def test_a_program_is_gone_if_it_failed_or_none_runs():
-    crew = Crew(CompanionConfig(program={"a": ProgramConfig(command="true")}), lambda *_: None)
+def test_a_program_is_gone_if_it_failed_or_has_succeeded_or_none_runs():
+    programs = dict.fromkeys("ab", ProgramConfig(command="true"))
+    landed = SuccessConfig(landed=True)
+    crew = Crew(CompanionConfig(program=programs, success=landed), lambda *_: None)
     a, b = SimpleNamespace(codes=[0], pid=None), SimpleNamespace(codes=[], pid=7)
     crew.running = {"a": a, "b": b}
     assert crew.ended() == ""
@@ -309,6 +311,11 @@ def test_a_program_is_gone_if_it_failed_or_none_runs():
     assert crew.ended() == "the program a is gone"
     a.codes, b.codes, b.pid = [0], [0], None
     assert crew.ended() == "the program a is gone"
+    named = Crew(
+        CompanionConfig(program=programs, success=replace(landed, exit="a")), lambda *_: None
+    )
+    named.running = {"a": a, "b": SimpleNamespace(codes=[], pid=7)}
+    assert named.ended() == "the program a is gone"
 
 
 def test_only_a_heartbeat_that_was_not_heard_before_makes_a_program_ready():
