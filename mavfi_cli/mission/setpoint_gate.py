@@ -101,7 +101,8 @@ class SetpointGate:
         self._noted_s = self._handed_s = -math.inf
         self._silent_s = _SILENT_S * speed
         self._heartbeats: dict[tuple[int, int], float] = {}  # newest, by system and component
-        self._steady: dict[tuple[int, int, int], _Stream] = {}  # by sender and message id
+        # By peer, system, component and message id.
+        self._steady: dict[tuple[Peer | None, int, int, int], _Stream] = {}
         self._commanders = SetpointView.Commanders()
         self._failed = False
         self._withheld = False  # what was last said of a setpoint
@@ -152,7 +153,7 @@ class SetpointGate:
     def _judge(self, message: Message, now_s: float, sender: Peer | None) -> list[Message]:
         if text := self._commanders.another(message, sender):
             self._say(text, math.inf, "program")
-        if self._is_stale(message, now_s):
+        if self._is_stale(message, now_s, sender):
             self._counts.stale += 1
             return [message] if self._settings.watch_only else []
         self._checks += 1
@@ -188,17 +189,17 @@ class SetpointGate:
         self._counts.brake += 1
         return self._standstill(message)
 
-    def _is_stale(self, message: Message, now_s: float) -> bool:
+    def _is_stale(self, message: Message, now_s: float, sender: Peer | None) -> bool:
         """Return True if a setpoint is stale. Say so once, and then every minute.
 
         Setpoints are stale if their sender no longer changes them, and the companion is gone or
         this sender sends no more heartbeats.
         """
-        sender = message.get_srcSystem(), message.get_srcComponent()
+        ids = message.get_srcSystem(), message.get_srcComponent()
         content = tuple(  # as text, because NaN differs from itself
             repr(getattr(message, name)) for name in message.fieldnames if name != "time_boot_ms"
         )
-        key = (*sender, message.get_msgId())
+        key = (sender, *ids, message.get_msgId())
         stream = self._steady.pop(key, None)
         if stream is None or stream.content != content:
             stream = _Stream(content, now_s)
@@ -208,7 +209,7 @@ class SetpointGate:
         if now_s - stream.since_s < self._settings.stale_s:
             return False
         why = self._gone()
-        if not why and now_s - self._heartbeats.get(sender, now_s) > self._silent_s:
+        if not why and now_s - self._heartbeats.get(ids, now_s) > self._silent_s:
             why = "the companion's heartbeat is gone"
         doing = "pass" if self._settings.watch_only else "are withheld"
         is_due = now_s - stream.told_s >= _STALE_EVERY_S

@@ -260,17 +260,19 @@ def test_setpoints_of_a_gone_companion_are_told_once_then_every_minute(gate):
     assert len(own.said) == 4
 
 
-def test_setpoints_of_a_gone_companion_end_beside_those_of_another_commander(gate):
-    own = gate(gone=lambda: "the program script is gone")
+@pytest.mark.parametrize("component", [190, 191])
+def test_setpoints_of_a_gone_companion_end_beside_those_of_another_commander(gate, component):
+    own, peer, another = gate(gone=lambda: "the program script is gone"), object(), object()
     passed = []
-    for tick in range(1, 13):
-        for component, vx in ((191, 2.0), (190, 0.1 * tick)):
+    for tick in range(1, 14):
+        for sender, ids, vx in ((peer, 191, 2.0), (another, component, 0.1 * tick)):
             now_s = 1.0 + 0.1 * tick
-            message = received(setpoint(vx), component=component)
-            passed.append([m.vx for m in own.pass_between(message, Side.COMPANION, now_s)])
-    assert passed[::2] == [[2.0]] * 9 + [[]] * 3
+            message = received(setpoint(vx), component=ids)
+            passed.append([m.vx for m in own.pass_between(message, Side.COMPANION, now_s, sender)])
+    assert passed[::2] == [[2.0]] * 10 + [[]] * 3
     assert all(passed[1::2])
-    assert own.said[0] == "another commander, 1/190, sends setpoints"
+    also = "" if component == 190 else "also "
+    assert own.said[0] == f"another commander, {also}1/{component}, sends setpoints"
 
 
 def test_two_peers_with_the_same_ids_are_two_commanders_unless_one_succeeds_the_other(gate):
