@@ -1,11 +1,12 @@
-r"""Applies the rule of docs/results/replica-table4.toml to its missions, all faults counted.
+r"""Applies the rules of replica-table4.toml and replica-rosfi.toml to missions, all faults counted.
 
     python benchmarks/table4_rule.py docs/results/replica-table4-part*.parquet
 
 Reads exports of campaigns (`mavfi campaign export`). Prints tables with McNemar's exact test
-corrected by Holm: in each world, faults against the golden flights of the same seeds under both
-restart rules, and for each restart rule with detectors, each detector against no protection on the
-same faults. The latter counts only faults whose golden flight succeeds. Its last rows pool the
+corrected by Holm: in each world, faults against the golden flights of the same seeds under each
+restart rule; the restart rules against 1 s in all worlds, with the share of lost missions whose
+fault ended a node; and for each restart rule with detectors, each detector against no protection on
+the same faults. The last two count only faults whose golden flight succeeds. The last rows pool the
 worlds, which is not part of the rule, and are not corrected. Intervals are Wilson's, 95 %.
 """
 
@@ -17,6 +18,7 @@ from exported import PAIRED, Key, Row, against, arguments, flown, golden_lost, k
 
 from mavfi_cli.stats.paired import McNemar, holm
 
+_USUAL_S = 1.0  # restart that the other restart rules are compared with
 FAULT = (*PAIRED, "fault_target", "fault_seed")
 
 
@@ -46,11 +48,12 @@ def main() -> None:
     golden = golden_lost(rows)
     faults = [row for row in rows if row["level"] == "instruction" and key(row, PAIRED) in golden]
     worlds = sorted({row["world"] for row in faults})
+    restarts = sorted({row["label_node_restart_s"] for row in faults})
     losses = {
         (world, f"{restart_s:g} s"): against(
             {fault: golden[fault[: len(PAIRED)]] for fault in plain}, plain
         )
-        for restart_s in (1.0, 3600.0)
+        for restart_s in restarts
         for world in worlds
         if (plain := arm(faults, world=world, detector="", restart_s=restart_s))
     }
@@ -60,8 +63,39 @@ def main() -> None:
         print(f"| {name} | {test.only_second} | {test.only_first} | {p:.1g} |")
 
     healthy = [row for row in faults if not golden[key(row, PAIRED)]]
-    for restart_s in (1.0, 3600.0):
+    compare_restarts(healthy, restarts)
+    for restart_s in restarts:
         detectors(healthy, worlds, restart_s)
+
+
+def compare_restarts(healthy: list[Row], restarts: list[float]) -> None:
+    """Print what each restart rule loses without a detector, compared with a restart after 1 s."""
+    arms = {
+        restart_s: arm(healthy, world="", detector="", restart_s=restart_s)
+        for restart_s in restarts
+    }
+    tests = {
+        (f"{restart_s:g} s",): against(arms.get(_USUAL_S, {}), own)
+        for restart_s, own in arms.items()
+        if restart_s != _USUAL_S
+    }
+    head = ("dead nodes back after", "lost", "of these, dead nodes", "lost only then")
+    print(f"\n| {' | '.join(head)} | only after 1 s | p |")
+    print("|---|---|---|---|---|---|")
+    compares = {name: (test, p) for name, test, p in compared(tests)}
+    for restart_s, own in arms.items():
+        name = f"{restart_s:g} s"
+        gone = [
+            row
+            for row in healthy
+            if lost(row) and not row["detector"] and row["label_node_restart_s"] == restart_s
+        ]
+        dead = share(sum(bool(row["node_ended"]) for row in gone), len(gone))
+        cells = "| | |"
+        if name in compares:
+            test, p = compares[name]
+            cells = f"{test.only_second} | {test.only_first} | {p:.2g} |"
+        print(f"| {name} | {share(sum(own.values()), len(own))} | {dead} | {cells}")
 
 
 def detectors(healthy: list[Row], worlds: list[str], restart_s: float) -> None:
