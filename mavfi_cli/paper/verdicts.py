@@ -151,8 +151,8 @@ class JudgedClaim:
             }
             for place, fates in self.judgements.items()
         }
-        told = {name: getattr(self.claim, name) for name in ("name", "item", "words", "unit")}
-        return {**told, "judgements": judged}
+        claim = {name: getattr(self.claim, name) for name in ("name", "item", "words", "unit")}
+        return {**claim, "judgements": judged}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
