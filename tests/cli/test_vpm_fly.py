@@ -50,7 +50,7 @@ def test_model_and_flight_side_by_side(command_line, tmp_path, lawn):
     code, summary, err = command_line("campaign", "run", "out/flights", "--quiet")
     assert (code, err) == (0, "")
     assert "flights: 5 of 5 missions" in summary
-    overhead = command_line("vpm", "--vehicle", "spark", "--overhead", "out")[1]
+    overhead = command_line("vpm", "--vehicle", "spark", "--overhead", "out", "--full")[1]
     assert re.search(r"1 flight of out on x86 x [\d.]+: ", overhead)
 
 
